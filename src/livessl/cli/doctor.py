@@ -16,6 +16,9 @@ from livessl.cli.server_answers import add_server, ask
 from livessl.errors import UseError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from livessl.core.commission.blind_spots import BlindSpot
     from livessl.core.commission.finding import Finding
     from livessl.examination import Examination
     from livessl.recordings.assign import AssignedRecording
@@ -56,6 +59,8 @@ def run(arguments: argparse.Namespace) -> int:
         )
     elif not examination.findings and not arguments.json:
         print(f"no fault found in {_count(examination.sounds)}")
+    for line in blind_spot_lines(examination.blind_spots):
+        complain(line, kind="note")
     return OK if examination.is_faultless else FAILED
 
 
@@ -112,6 +117,22 @@ def finding_line(finding: Finding) -> str:
         f"{finding.severity:<8} {finding.fault:<12} {finding.message}{where}; {finding.cure}  "
         f"[{100 * finding.confidence:.0f} % sure]"
     )
+
+
+def blind_spot_lines(spots: Sequence[BlindSpot]) -> list[str]:
+    """Return a line for each fault that the sounds could not have shown."""
+    lines = []
+    for spot in spots:
+        names = " or ".join(repr(name) for name in spot.arrays)
+        along = ", ".join(f"{x:.2f}" for x in spot.along)
+        how = f"moved by less than {spot.least:.1f} m along ({along})"
+        if spot.fault == "turned":
+            how = f"turned by less than {spot.least:.0f} degrees about ({along})"
+        lines.append(
+            f"these sounds cannot show whether {names} is {how}; clap at places that you know, and run livessl "
+            "calibrate verify"
+        )
+    return lines
 
 
 def _count(sounds: int) -> str:

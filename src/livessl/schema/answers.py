@@ -226,7 +226,7 @@ class HeatMap(Versioned):
 
 
 class Secured(Model):
-    """Which connections are protected."""
+    """Connections that are protected."""
 
     nodes: bool = Field(description="Whether nodes need an enrolled key and are encrypted.", examples=[True])
     tokens: bool = Field(description="Whether clients need a token.", examples=[True])

@@ -40,7 +40,7 @@ Follower = Callable[[Site], Commit]
 
 _KEYS: Final = ("arrays", "uncertainty", "calibration", "temperature_c", "speed_of_sound_m_s", "c_m_s")
 _TAKEN: Final = (*_KEYS, "specs", "processed")
-"""What is taken over of a site that was loaded anew: keys of its file and the speed of sound, and what they make."""
+"""Fields that are taken over from a site that was loaded anew: keys of its file, the speed of sound, and the arrays."""
 
 
 class SetUpChangedError(RunError):

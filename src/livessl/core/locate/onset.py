@@ -65,7 +65,7 @@ class _Answer:
 
     @property
     def is_sure(self) -> bool:
-        """Whether a second look is not worth its time."""
+        """True if a second look is not worth its time."""
         return self.refused is None and self.judgement.features.is_sure
 
     def rank(self) -> tuple[bool, bool, float]:

@@ -23,9 +23,11 @@ from livessl.server.api.headers import SafeHeaders, other_origins
 from livessl.server.api.history_routes import history_routes
 from livessl.server.api.hosts import HostCheck, ServerNames
 from livessl.server.api.journal_routes import journal_routes
+from livessl.server.api.link_routes import link_routes
 from livessl.server.api.live import live_routes
 from livessl.server.api.log_route import log_route
 from livessl.server.api.metrics import metrics_route
+from livessl.server.api.point_routes import point_route
 from livessl.server.api.proposal_routes import proposal_routes
 from livessl.server.api.proxy import BehindProxy
 from livessl.server.api.queries import refuse_unknown_parameters
@@ -87,6 +89,8 @@ def create_app(parts: Parts, access: Access) -> FastAPI:
         proposal_routes(parts),
         clip_routes(parts),
         relocate_route(parts),
+        link_routes(access),
+        point_route(parts),
         reload_route(parts),
         log_route(parts),
     ):

@@ -16,7 +16,7 @@ import { drawTogether, Plan } from "./plan.js";
 import { ZoneEditor } from "./plan-zones-editor.js";
 import { Relocate } from "./relocate.js";
 import { SetUp } from "./set-up.js";
-import { readColours } from "./theme.js";
+import { readColours } from "./plan-style.js";
 
 const API = new URL("api/v1/", document.baseURI);
 /** Events that are loaded from the store when the page connects. */
