@@ -7,8 +7,8 @@ sounds have standard deviations that grow with the distance as those of the rend
 7 m), and 20 us for 5 % of the sounds at each array, which received an echo.
 
 Beside what the doctor says stands how often the best test would tell the fault that looks for nothing else: it knows
-the axis of the turn, or the line of the shift, but not the array and the sense, and tells the fault in 2 % of the careful
-set-ups. It follows from the slopes of the delays. A doctor that has to tell other faults, too, names fewer.
+the axis of the turn, or the line of the shift, but not the array and the sense, and tells the fault in 2 % of the
+careful set-ups. It follows from the slopes of the delays. A doctor that has to tell other faults, too, names fewer.
 """
 
 from __future__ import annotations
