@@ -46,23 +46,24 @@ _BACKGROUND_RMS: Final = 2.5
 """Power of a background at a position, relative to its root mean square elsewhere, that is there by chance: it is known
 from some tenths of a second, and the position is where the background adds to the sound."""
 
-_BEGINNING_FIT: Final = 8.0
-"""Log-odds by which a beginning that has nothing at the position lowers the confidence. This constant and the next three
-are fitted as `_BACKGROUND_FIT` is."""
+_BEGINNING_FIT: Final = 9.2
+"""Log-odds by which a beginning that has nothing at the position lowers the confidence. This constant and the next
+three are fitted as `_BACKGROUND_FIT` is."""
 
-CLEAR_BEGINNING: Final = 3.0
-"""Peak-to-RMS ratio of a beginning at a position at and above which the sound clearly began there."""
+_BEGUN: Final = 0.4
+"""Peak-to-RMS ratio of a beginning, relative to that of the whole sound, from which on it lacks nothing."""
 
-_WEAK_FIT: Final = 1.75
+_WEAK_FIT: Final = 1.5
 """Log-odds lost for each unit of the peak-to-RMS ratio by which the second array falls short of `CLEAR_PEAK_TO_RMS`,
 where lines of sight that cross determine the distance: one of them is then little better than noise."""
 
-_SPREAD_FIT: Final = 1.5
+_SPREAD_FIT: Final = 1.1
 """Factor on the standard deviation along the position's least certain axis, so that the share of right peaks that are
 beyond `NEAR_M` is that of a normal error: reflections shift delays by more than the noise does."""
 
-_LINES_SPREAD_FIT: Final = 3.0
-"""The same where all arrays are lines: three of them give as many angles as there are coordinates, and none to spare."""
+_LINES_SPREAD_FIT: Final = 10.0
+"""The same where all arrays are lines: three of them give as many angles as there are coordinates, with none to
+spare."""
 
 _LEAST_LOG_ODDS: Final = -100.0
 """Log-odds below which a probability is 0 for every purpose; a background may be any number of times the power."""
@@ -162,8 +163,10 @@ class ConfidenceFeatures:
 
     @property
     def lacking(self) -> float:
-        """How much a clear beginning at the position is missing, 0 to 1; 0 if the beginning is not known."""
-        return 0.0 if self.beginning is None else max(0.0, 1.0 - self.beginning / CLEAR_BEGINNING)
+        """How much of the peak is missing where the sound begins, 0 to 1; 0 if the beginning is not known."""
+        if self.beginning is None or self.peak_to_rms <= 0.0:
+            return 0.0
+        return max(0.0, 1.0 - self.beginning / (_BEGUN * self.peak_to_rms))
 
     @property
     def confidence_at_known_distance(self) -> float:

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from livessl.core.correlate.gcc_phat import LagSampling, require_band
-from livessl.core.correlate.onset_gcc import OnsetFrontEnd, OnsetGCC, summed
+from livessl.core.correlate.onset_gcc import OnsetFrontEnd, OnsetGCC, has_long_windows, summed
 from livessl.core.geometry import Grid, microphone_pairs
 from livessl.core.locate import ambiguity, outliers
 from livessl.core.locate.beginning import beginning, first_frame
@@ -311,7 +311,8 @@ class Onset(MapEstimator):
             onsets = self.onset_front_end(array, sound.sample_rate_hz).push_segments(sound.segments)
             return self._evidence_of(array, sound, onsets, None)
         evidence = self._evidence_of(array, sound, summed(sound.onsets), _background(sound))
-        begun = beginning(sound, first)
+        is_wide = has_long_windows(self.arrays[array].aperture_m / self.c_m_s)  # as long as a beginning
+        begun = None if is_wide else beginning(sound, first)
         if begun is None:
             return evidence
         onsets = sound.onsets[begun]
