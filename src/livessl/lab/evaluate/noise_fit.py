@@ -9,7 +9,7 @@ import numpy as np
 import scipy
 
 from livessl.core.locate.confidence import NEAR_M, ConfidenceFeatures
-from livessl.core.types import FloatArray
+from livessl.core.types import BoolArray, FloatArray
 from livessl.lab.evaluate.localizer_report import Columns
 from livessl.lab.evaluate.noise_sounds import OTHER_SOUNDS
 from livessl.lab.evaluate.noise_summary import OURS
@@ -64,7 +64,7 @@ def noise_fit(columns: Columns) -> NoiseFit:
     chosen = (columns["method"] == OURS) & ~np.isin(columns["sound"], list(OTHER_SOUNDS))
     chosen &= np.nan_to_num(columns["share"].astype(np.float64)) > 0.99
     right = columns["error_m"][chosen].astype(np.float64) <= NEAR_M
-    features = [_features(columns, row) for row in np.flatnonzero(chosen)]
+    features = _features(columns, chosen)
     log_odds, determined = _otherwise(features)
     lacking, weakness = (np.array([getattr(each, name) for each in features]) for name in ("lacking", "weakness"))
     spread_m = np.maximum([each.spread_m for each in features], 1e-9)
@@ -85,20 +85,24 @@ def noise_fit(columns: Columns) -> NoiseFit:
     return NoiseFit(*(float(value) for value in found.x))
 
 
-def _features(columns: Columns, row: int) -> ConfidenceFeatures:
-    value = {name: float(columns[name][row]) for name in ("margin", "standing", "crossing_deg", "second_array")}
-    value |= {name: float(columns[name][row]) for name in ("background", "beginning", "spread_m")}
-    return ConfidenceFeatures(
-        value["margin"],
-        value["standing"],
-        value["crossing_deg"],
-        value["second_array"],
-        bool(columns["whole"][row]),
-        background=value["background"],
-        beginning=None if np.isnan(value["beginning"]) else value["beginning"],
-        spread_m=value["spread_m"],
-        of_lines=bool(columns["of_lines"][row]),
-    )
+def _features(columns: Columns, chosen: BoolArray) -> list[ConfidenceFeatures]:
+    """Return the features of the chosen sounds; what is null becomes NaN."""
+    names = ("margin", "standing", "crossing_deg", "second_array", "background", "beginning", "spread_m")
+    values = {name: columns[name][chosen].astype(np.float64) for name in names}
+    return [
+        ConfidenceFeatures(
+            float(values["margin"][row]),
+            float(values["standing"][row]),
+            float(values["crossing_deg"][row]),
+            float(values["second_array"][row]),
+            bool(whole),
+            background=float(values["background"][row]),
+            beginning=None if np.isnan(values["beginning"][row]) else float(values["beginning"][row]),
+            spread_m=float(values["spread_m"][row]),
+            of_lines=bool(of_lines),
+        )
+        for row, (whole, of_lines) in enumerate(zip(columns["whole"][chosen], columns["of_lines"][chosen], strict=True))
+    ]
 
 
 def _otherwise(features: list[ConfidenceFeatures]) -> tuple[FloatArray, FloatArray]:
