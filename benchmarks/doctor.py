@@ -197,10 +197,10 @@ def table(rows: Sequence[Row]) -> str:
         cells = [fault.name]
         for count in counts:
             own = [row for row in rows if row["fault"] == fault.name and row["arrays"] == count]
-            cells.append(_share([row["named"] for row in own]) if fault.expected else f"- of {len(own)}")
+            cells.append(share([row["named"] for row in own]) if fault.expected else f"- of {len(own)}")
             cells += [str(sum(row[what] for row in own)) for what in ("either", "open")]
             wrong = [row["wrong"] for row in own]
-            cells.append(str(sum(wrong)) if fault.expected else _share(wrong))
+            cells.append(str(sum(wrong)) if fault.expected else share(wrong))
         if any(row["fault"] == fault.name for row in rows):
             lines.append(cells)
     return as_markdown([Table(titles, lines), _cost(rows)])
@@ -209,14 +209,15 @@ def table(rows: Sequence[Row]) -> str:
 def _cost(rows: Sequence[Row]) -> str:
     """Say how much time of a processor the conclusions took."""
     of = {
-        kind: [row["cpu_s"] for row in rows if (row["fault"] == "none") == (kind == "without faults")]
+        kind: [row["cpu_s"] for row in rows if row["fault"].startswith("none") == (kind == "without faults")]
         for kind in ("without faults", "with one")
     }
     parts = [f"{np.median(each):.2f} s {kind} ({np.percentile(each, 95):.2f} s)" for kind, each in of.items() if each]
     return f"The examination of ten sounds took this much time of one processor, median and 95 %: {', '.join(parts)}."
 
 
-def _share(flags: Sequence[bool]) -> str:
+def share(flags: Sequence[bool]) -> str:
+    """Return how many of some are true, with the interval of 95 % (Wilson)."""
     low, high = wilson(sum(flags), len(flags))
     return f"{sum(flags)} of {len(flags)} ({100 * low:.0f} to {100 * high:.0f} %)"
 

@@ -20,6 +20,7 @@ from typing import Any, Final
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from livessl.core.commission.poses import moved
 from livessl.core.geometry import posed, tetrahedron
 from livessl.core.types import Event, Float32Array, FloatArray, IntArray
 from livessl.simulation.of_site import scene_of
@@ -31,6 +32,11 @@ RATE_HZ: Final = 16000.0
 SOUNDS: Final = 10
 ARRAYS: Final = ("north", "south", "west")
 POSITION_STD_M, ORIENTATION_STD_DEG, MICROPHONE_STD_M = 0.02, 1.2, 0.002
+MEASURED_STD_M, MEASURED_STD_DEG = 0.01, 0.4
+MEASURED: Final = {"position_m": 0.01, "orientation_deg": 0.5}
+"""What remains of the errors of a pose, along each axis, after `livessl calibrate poses` with eight claps, and what the
+site file says of it."""
+
 CLOCK_S: Final = 2.0
 
 Recordings = dict[str, Float32Array]
@@ -61,6 +67,7 @@ class Fault:
     `routed` says which plugs are in which inputs. `expected` holds the codes that name it; empty if nothing should be
     said. `of` is "array" or "channel" if the array, or also the channel, has to be named. `settings` are settings of
     the site file that are wrong. `live` is False where a server finds it without sounds, from what the nodes report.
+    `measured` is True where the poses in the site file were measured with claps before the fault was made.
     """
 
     name: str
@@ -71,6 +78,7 @@ class Fault:
     filed: Callable[[Arrays, Target], None] | None = None
     settings: tuple[tuple[str, Any], ...] = ()
     live: bool = True
+    measured: bool = False
 
 
 def _channel(change: Callable[[Float32Array, np.random.Generator], Float32Array]) -> Callable[..., None]:
@@ -163,6 +171,7 @@ def _displace(filed: Arrays, at: Target) -> None:
 
 FAULTS: Final = (
     Fault("none", (), None),
+    Fault("none, poses measured", (), None, live=False, measured=True),
     Fault("dead", ("dead",), recorded=_channel(lambda x, _: 0.0 * x)),
     Fault("dead, own noise at -50 dBFS", ("deaf",), recorded=_channel(_noise)),
     Fault("20 dB weaker", ("level",), recorded=_channel(lambda x, _: np.float32(0.1) * x)),
@@ -184,6 +193,8 @@ FAULTS: Final = (
     Fault("turned by 15 degrees", ("turned",), "array", filed=_turn(15.0)),
     Fault("turned by 30 degrees", ("turned",), "array", filed=_turn(30.0)),
     Fault("moved by 0.5 m", ("moved",), "array", filed=_shift(0.5)),
+    Fault("turned by 5 degrees, poses measured", ("turned",), "array", filed=_turn(5.0), live=False, measured=True),
+    Fault("moved by 0.5 m, poses measured", ("moved",), "array", filed=_shift(0.5), live=False, measured=True),
     Fault("temperature 20 degrees off", ("temperature",), None, settings=(("temperature_c", 0.0),)),
     Fault("clock 2 s off", ("clock",), None, recorded=_behind, live=False),
 )
@@ -226,13 +237,14 @@ class Room:
 
     def site_with(self, fault: Fault, arrays: int) -> Site:
         """The site file with a fault that is made there."""
-        filed = dict(self._filed)
+        filed = {name: self._measured(name) if fault.measured else self._filed[name] for name in ARRAYS}
         if fault.filed is not None:
             fault.filed(filed, self.target)
         text: dict[str, Any] = {
             "site": "doctor",
             "room": {"size_m": self._size_m},
             "arrays": {name: {"microphones_m": filed[name].tolist()} for name in ARRAYS[:arrays]},
+            **({"uncertainty": MEASURED} if fault.measured else {}),
             **dict(fault.settings),
         }
         return parse_site(json.dumps(text))
@@ -257,12 +269,22 @@ class Room:
 
     def built(self, name: str) -> FloatArray:
         """The true places of an array's microphones, metres: not quite those of the site file."""
+        turn, shift_m, own_m = self._off(name)
+        return moved(self._filed[name], shift_m, turn) + own_m
+
+    def _measured(self, name: str) -> FloatArray:
+        """The places of an array's microphones with its pose as measured, metres."""
+        turn, shift_m, _ = self._off(name)
+        rng = np.random.default_rng([self.seed, 4, ARRAYS.index(name)])
+        off_m, off = rng.normal(0.0, MEASURED_STD_M, 3), np.radians(rng.normal(0.0, MEASURED_STD_DEG, 3))
+        return moved(moved(self._filed[name], shift_m, turn), off_m, off)
+
+    def _off(self, name: str) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """How an array differs from the site file: turn, radians, shift, and shift of each microphone, metres."""
         rng = np.random.default_rng([self.seed, 2, ARRAYS.index(name)])
-        filed_m = self._filed[name]
-        turn = Rotation.from_rotvec(np.radians(rng.normal(0.0, ORIENTATION_STD_DEG, 3)))
-        own_m = rng.normal(0.0, MICROPHONE_STD_M, filed_m.shape)
-        centre_m = filed_m.mean(axis=0)
-        return np.asarray(turn.apply(filed_m - centre_m) + centre_m + rng.normal(0.0, POSITION_STD_M, 3) + own_m)
+        turn = np.radians(rng.normal(0.0, ORIENTATION_STD_DEG, 3))
+        own_m = rng.normal(0.0, MICROPHONE_STD_M, self._filed[name].shape)
+        return turn, rng.normal(0.0, POSITION_STD_M, 3), own_m
 
     def error_m(self, events: Sequence[Event]) -> float:
         """Median distance between the sounds and what was found of them, metres; infinite where nothing was."""

@@ -194,7 +194,9 @@ def alerted(folder: Path, kills: int, seed: int) -> int:
         make_recordings(recordings, 4 * kills, gap_s=1.2)
     shutil.rmtree(folder / "site", ignore_errors=True)
     outcome = play_killed(recordings, folder / "site", kills, seed)
-    counts = {name: getattr(outcome, name) for name in ("kills", "sounds", "changes", "differing", "copies")}
+    counts = {
+        name: getattr(outcome, name) for name in ("kills", "interrupted", "sounds", "changes", "differing", "copies")
+    }
     counts |= {"alerts": len(outcome.wanted), "accepted": len(outcome.accepted)}
     wrong = {name: getattr(outcome, name) for name in ("missing", "unwanted", "forgotten")}
     print(json.dumps(counts | wrong, indent=1))

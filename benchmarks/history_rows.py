@@ -172,17 +172,28 @@ def check_rows(rows: Rows) -> None:
         assert {next(tagged) for _ in wanted} == wanted
 
 
-def fill(place: str, count: int) -> float:
-    """Store random events, oldest first, by the database's own means for many rows; return how many a second."""
+def fill(place: str, count: int, first: int = 0, make: Callable[[int, int], Rows] = random_rows) -> float:
+    """Store random events, oldest first, by the database's own means for many rows; return how many a second.
+
+    Parameters
+    ----------
+    place : str
+        SQLite file, or URL of a PostgreSQL database.
+    count : int
+    first : int
+        Number of the first event: how many are there already.
+    make : callable
+        Returns the rows of as many events from a number on.
+    """
     Store(place if "://" in place else Path(place)).close()  # makes the tables
     check_rows(random_rows(0, 100))
     begun = time.perf_counter()
     with ExitStack() as stack:
         put = stack.enter_context(_postgresql_copy(place) if "://" in place else _sqlite_rows(place))
-        for first in range(0, count, BATCH):
-            put(random_rows(first, min(BATCH, count - first)))
-            if first % 500_000 == 0:
-                print(f"{first} of {count} events are stored", file=sys.stderr)
+        for done in range(0, count, BATCH):
+            put(make(first + done, min(BATCH, count - done)))
+            if done % 500_000 == 0:
+                print(f"{done} of {count} events are stored", file=sys.stderr)
     return count / (time.perf_counter() - begun)
 
 

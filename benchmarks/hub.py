@@ -25,6 +25,7 @@ from hub_desk import newest_at
 from hub_world import HubWorld, running_world
 from livessl.server.api.encode import JsonObject
 from postgresql import SETTINGS, running_postgresql
+from processor_time import processor_s
 from small_site import wait_until
 
 MAX_RETURN_S: Final = 1.0
@@ -36,7 +37,7 @@ def measure_faults(world: HubWorld, events: int, cuts: int) -> JsonObject:
     each = -(-events // ((cuts + 2) * len(world.links)))  # a part for each cut and each death
     world.finish(10)
     world.wait_until_shown()
-    returns, processor_s = [], []
+    returns, spent_s = [], []
     for _ in range(cuts):
         for link in world.links.values():
             link.cut()
@@ -44,9 +45,9 @@ def measure_faults(world: HubWorld, events: int, cuts: int) -> JsonObject:
         wait_until(lambda: not any(desk.store.backlog.unsaved for desk in world.desks.values()), "stored events")
         for link in world.links.values():
             link.mend()
-        before_s = _processor_s()
+        before_s = processor_s(os.getpid())
         returns.append(_until_shown(world))
-        processor_s.append(_processor_s() - before_s)
+        spent_s.append(processor_s(os.getpid()) - before_s)
     world.cluster[-1].kill()
     world.finish(each)
     nats_killed_s = _until_shown(world)
@@ -60,30 +61,13 @@ def measure_faults(world: HubWorld, events: int, cuts: int) -> JsonObject:
         "events": sum(world.sent.values()),
         "waiting_at_each_return": each * len(world.links),
         "shown_after_return_s": [round(seconds, 3) for seconds in returns],
-        "processor_time_of_each_return_s": [round(seconds, 3) for seconds in processor_s],
+        "processor_time_of_each_return_s": [round(seconds, 3) for seconds in spent_s],
         "shown_after_a_nats_server_died_s": round(nats_killed_s, 3),
         "shown_after_the_hub_at_work_died_s": round(hub_killed_s, 3),
         "each_once": {name: sorted(ids) for name, ids in stored.items()}
         == {name: sorted(ids) for name, ids in wanted.items()},
         "in_order": stored == wanted,
     }
-
-
-def _processor_s() -> float:
-    """Return the processor time so far, in seconds, of this process and all that it has started and that still run."""
-    parents, times = {}, {}
-    for folder in Path("/proc").glob("[0-9]*"):
-        try:
-            fields = (folder / "stat").read_text(encoding="utf-8").rpartition(")")[2].split()
-        except OSError:  # it has just ended
-            continue
-        parents[int(folder.name)] = int(fields[1])
-        times[int(folder.name)] = (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-    ours, more = set(), {os.getpid()}
-    while more:
-        ours |= more
-        more = {process for process, parent in parents.items() if parent in more} - ours
-    return sum(times[process] for process in ours)
 
 
 def _until_shown(world: HubWorld) -> float:

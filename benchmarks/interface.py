@@ -255,7 +255,7 @@ def losses(minutes: float, channels: int, rate_hz: int, spinning: int) -> None:
         print(
             f"{samples} samples of {channels} channels at {rate_hz} Hz, {spinning} processes spinning: "
             f"{flagged} lost in {gaps} gaps that are flagged, {unflagged} lost without a flag, "
-            f"{device.overruns} blocks lost between the processes, {device.starts - 1} restarts"
+            f"{device.losses.overruns} blocks lost between the processes, {device.starts - 1} restarts"
         )
         if unflagged:
             raise SystemExit(1)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final, cast
@@ -12,14 +12,16 @@ import numpy as np
 from livessl.clock import Clock, SystemClock
 from livessl.core.stream.final_pass import FinalResults
 from livessl.core.types import FRAME_NS, Estimate, Event, Status
-from livessl.server.alerts.evidence import ClipSource
+from livessl.server.alerts.evidence import ClipSource, Evidence
+from livessl.server.alerts.in_force import Surroundings
 from livessl.server.alerts.message import AlertMessages
-from livessl.server.alerts.service import Alerts
+from livessl.server.alerts.service import Alerts, Conditions
 from livessl.server.api.encode import JsonObject, Messages
 from livessl.server.event_log import EventLog
 from livessl.server.latency import Arrivals, Latency
 from livessl.server.set_up_watch import SetUpState
 from livessl.server.store import Store
+from livessl.server.zones.shapes import fixed_zones
 from livessl.site.models import Site
 from small_site import Changes, site_of
 
@@ -119,12 +121,20 @@ class Desk:
         self.published: list[JsonObject] = []
         self.arrays, self.findings, self.time = QuietArrays(state), NoFindings(), LiveTime()
         self.store = Store.of(site)
-        arrays, findings, time = cast(Any, self.arrays), cast(Any, self.findings), cast(Any, self.time)
-        publish, url = self.published.append, "http://127.0.0.1:8000"
-        self.alerts = Alerts(site, self.clock, self.store, arrays, findings, time, publish, url, clips=clips)
+        self.on_alert: Callable[[JsonObject], None] = lambda _: None
+        zones = fixed_zones(site)
+        evidence = Evidence(lambda: site, zones, clips)
+        around = Surroundings(self.clock, self.store, zones, "http://127.0.0.1:8000", evidence)
+        conditions = Conditions(cast(Any, self.arrays), cast(Any, self.findings), cast(Any, self.time))
+        self.alerts = Alerts(site, around, conditions, self.publish)
         latency = Latency(self.clock, Arrivals())
         self.log = EventLog(site.site, self.clock, self.store, latency, lambda _: None, self.alerts)
         self.log.begin_live()
+
+    def publish(self, alert: JsonObject) -> None:
+        """Keep an alert, and call `on_alert` on the thread of the alerts."""
+        self.published.append(alert)
+        self.on_alert(alert)
 
     def finish(self, *events: Event) -> None:
         """Let events become final."""

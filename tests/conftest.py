@@ -40,6 +40,8 @@ LONGEST_FIRST = (
     "test_live.py",
     "test_recorded_files.py",
     "test_release.py",
+    "test_api_fuzz.py",
+    "test_unchanged.py",
     "test_install.py",
     "test_real_recordings.py",
     "test_soak.py",
@@ -50,6 +52,7 @@ LONGEST_FIRST = (
     "test_campaign.py",
     "test_clocks_and_backfill.py",
     "test_overloaded_server.py",
+    "test_killed_alerts.py",
 )
 """Files that take minutes: begun first, no worker is left with one of them when the others are done."""
 

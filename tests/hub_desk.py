@@ -23,6 +23,7 @@ from livessl.server.forwarding.link import HubLink
 from livessl.server.forwarding.outbox import Outbox
 from livessl.server.latency import Arrivals, Latency
 from livessl.server.store import Store
+from livessl.service_manager import ServiceManager
 from livessl.site.models import Site
 from small_site import HANG_S, Changes, site_of
 
@@ -100,9 +101,9 @@ def make_hub(database: Path | str, urls: Sequence[str], directory: Path, **chang
 
 
 @contextmanager
-def running_hub(hub: Hub) -> Iterator[HubServer]:
+def running_hub(hub: Hub, service: ServiceManager | None = None) -> Iterator[HubServer]:
     """A hub in a thread."""
-    server = HubServer(hub, SystemClock())
+    server = HubServer(hub, SystemClock(), service)
     thread = Thread(target=server.run)
     thread.start()
     try:

@@ -51,6 +51,12 @@ class NatsServer:
     def url(self) -> str:
         return f"nats://127.0.0.1:{self.port}"
 
+    @property
+    def pid(self) -> int:
+        """Process id."""
+        assert self._process is not None
+        return self._process.pid
+
     def start(self) -> None:
         """Start the process; `is_healthy` says when it serves."""
         assert NATS_SERVER is not None

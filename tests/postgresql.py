@@ -60,9 +60,15 @@ class PostgreSQL:
         """The URL of an empty schema."""
         self._schemas += 1
         name = f"test_{self._schemas}"
-        with psycopg.connect(f"{self._address()}", autocommit=True) as connection:
+        with psycopg.connect(self.address, autocommit=True) as connection:
             connection.execute(f"CREATE SCHEMA {name}")
-        return f"{self._address()}?options=-csearch_path%3D{name}"
+        return f"{self.address}?options=-csearch_path%3D{name}"
+
+    @property
+    def pid(self) -> int:
+        """Process id of the server, of which the processes of its connections are children."""
+        assert self._process is not None
+        return self._process.pid
 
     def start(self) -> None:
         """Start the server, and wait until it answers."""
@@ -76,7 +82,7 @@ class PostgreSQL:
             assert self._process is not None
             assert self._process.poll() is None, "PostgreSQL has ended"
             try:
-                psycopg.connect(self._address(), connect_timeout=2).close()
+                psycopg.connect(self.address, connect_timeout=2).close()
             except psycopg.OperationalError:
                 return False
             return True
@@ -90,7 +96,9 @@ class PostgreSQL:
             self._process.wait(timeout=HANG_S)
             self._process = None
 
-    def _address(self) -> str:
+    @property
+    def address(self) -> str:
+        """The URL of its one database."""
         return f"postgresql://livessl@127.0.0.1:{self.port}/postgres"
 
     def _run(self, program: str, *arguments: str) -> None:

@@ -23,6 +23,7 @@ from livessl.core.types import Float32Array, Frame, Mark
 from livessl.recordings.assign import AssignedRecording
 from livessl.recordings.recording import MemoryRecording
 from livessl.server.app import Server
+from livessl.service_manager import ServiceManager
 from livessl.simulation.scene import Scene, make_scene, render
 from livessl.site.load import parse_site
 from livessl.site.models import Site
@@ -169,10 +170,13 @@ def started(*command: str | Path, **options: Any) -> Iterator[subprocess.Popen[s
 
 @contextmanager
 def running_server(
-    site: Site, method: str | None = None, read_site: Callable[[], Site] | None = None
+    site: Site,
+    method: str | None = None,
+    read_site: Callable[[], Site] | None = None,
+    service: ServiceManager | None = None,
 ) -> Iterator[Server]:
     """A whole server in a thread, answering."""
-    server = Server(site, SystemClock(), method=method, read_site=read_site)
+    server = Server(site, SystemClock(), method=method, read_site=read_site, service=service)
     thread = Thread(target=server.run)
     thread.start()
     try:

@@ -11,6 +11,9 @@ import pytest
 ROOT = Path(__file__).parents[1]
 FOLDERS_WITHOUT_DOCUMENTS = {".git", ".venv", "node_modules", "build", "dist"}
 LINK = re.compile(r"\]\(\s*<?([^()\s<>]+)>?(?:\s+\"[^\"]*\")?\s*\)")
+SOURCES = (ROOT, ROOT / "src", ROOT / "src" / "livessl", ROOT / "tests")
+TABLE_ROW = re.compile(r"^\|.*\|$", re.MULTILINE)
+FILE_NAME = re.compile(r"`([\w./-]*(?:/|\.(?:py|js|sh|toml|yml|md)))`")
 CODE = re.compile(r"^```.*?^```|`[^`\n]*`", re.MULTILINE | re.DOTALL)
 
 
@@ -67,3 +70,23 @@ def test_a_link_to_a_missing_file_or_heading_is_found(tmp_path: Path) -> None:
         encoding="utf-8",
     )
     assert broken_links(page) == ["gone.md", "other.md#gone", "#gone"]
+
+
+@pytest.mark.parametrize("name", ["README.md", "CONTRIBUTING.md"])
+def test_files_that_tables_name_exist(name: str) -> None:
+    rows = TABLE_ROW.findall((ROOT / name).read_text(encoding="utf-8"))
+    names = [found for row in rows for found in FILE_NAME.findall(row)]
+    assert len(names) > 20
+    assert [found for found in names if not any((source / found).exists() for source in SOURCES)] == []
+
+
+def test_tests_that_a_table_names_exist() -> None:
+    rows = [re.findall(r"`([\w./]+)`", row) for row in TABLE_ROW.findall((ROOT / "CONTRIBUTING.md").read_text("utf-8"))]
+    named = [(names[0], name) for names in rows if names and "test_" in names[0] for name in names[1:]]
+    assert len(named) == 20
+    missing = [
+        (file, name)
+        for file, name in named
+        if f"def test_{name}(" not in (ROOT / "tests" / file).read_text(encoding="utf-8")
+    ]
+    assert missing == []

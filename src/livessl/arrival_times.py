@@ -1,4 +1,4 @@
-"""When arrays that one clock samples received the same sounds, from their recordings.
+"""Finds when arrays that one clock samples received the same sounds, from their recordings.
 
 With rough poses and places the microphones of each array are shifted to the time of emission and summed; what is left
 between the arrays is below the length of a window, and is measured like the delays within an array.

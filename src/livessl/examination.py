@@ -9,6 +9,7 @@ import numpy as np
 
 from livessl import offline
 from livessl.clock import UnpacedClock
+from livessl.core.commission.blind_spots import BlindSpot
 from livessl.core.commission.channels import ChannelMeter
 from livessl.core.commission.clocks import Rises, find_clock_faults
 from livessl.core.commission.crosstalk import CrosstalkMeter
@@ -20,7 +21,7 @@ from livessl.core.types import Event, Observation
 from livessl.recordings.assign import AssignedRecording
 from livessl.site.build.inputs import with_inputs
 from livessl.site.build.layout import layout_findings
-from livessl.site.build.set_up import find_set_up_faults
+from livessl.site.build.set_up import find_set_up_faults, hidden_by
 from livessl.site.models import Site
 
 
@@ -34,13 +35,16 @@ class Examination:
         Errors first.
     sounds : int
         Number of sounds that were examined.
+    blind_spots : tuple of BlindSpot
+        Faults of poses that these sounds could not have shown.
     """
 
     findings: tuple[Finding, ...]
     sounds: int
+    blind_spots: tuple[BlindSpot, ...] = ()
 
     @property
-    def is_sound(self) -> bool:
+    def is_faultless(self) -> bool:
         """True if no finding is an error."""
         return all(finding.severity is not Severity.ERROR for finding in self.findings)
 
@@ -118,7 +122,9 @@ def conclude(site: Site, gathered: Gathered) -> Examination:
     """Draw the conclusions from what was gathered."""
     findings = [*gathered.findings, *find_set_up_faults(site, gathered.sounds), *layout_findings(site)]
     told = in_order(with_inputs(site, _without_consequences(findings)))
-    return Examination(tuple(told), len(gathered.sounds))
+    is_known = all(one.fault not in OF_SET_UP and one.fault != "clock" for one in told)
+    hidden = hidden_by(site, gathered.sounds) if is_known else ()  # sizes hold for a set-up nearly as filed
+    return Examination(tuple(told), len(gathered.sounds), hidden)
 
 
 def _without_consequences(findings: Sequence[Finding]) -> list[Finding]:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from itertools import accumulate, count
+from pathlib import Path
 from threading import Thread
 from types import TracebackType
 from typing import Self
@@ -33,7 +34,9 @@ from livessl.recordings.assign import AssignedRecording
 from livessl.recordings.recording import MemoryRecording
 from livessl.server.inlet import QUEUE_MESSAGES
 from livessl.server.receiver import Item, Joined, Left, Receiver
+from livessl.service_manager import ServiceManager
 from livessl.site.models import Site
+from notify_socket import listening
 from small_site import HANG_S, RATE_HZ, frame, hiss, mark, site_of, wait_until
 
 START_NS = 1_767_225_600_000_000_000
@@ -52,6 +55,16 @@ class PatientClock(SystemClock):
     def monotonic_ns(self) -> int:
         """Return a constant time."""
         return 0
+
+
+class HurriedClock(SystemClock):
+    """A clock by which a second passes from each look to the next."""
+
+    def __init__(self) -> None:
+        self._seconds = count()
+
+    def monotonic_ns(self) -> int:
+        return 1_000_000_000 * next(self._seconds)
 
 
 @dataclass
@@ -309,19 +322,31 @@ def test_device_is_entered_captured_and_left() -> None:
         assert there.messages(array)[-1].frame_index == FIRST + 29
 
 
-def test_device_problem_and_its_end_reach_the_server(caplog: pytest.LogCaptureFixture) -> None:
+def test_device_problem_and_its_end_reach_the_server_and_the_service_manager(
+    caplog: pytest.LogCaptureFixture, tmp_path: Path
+) -> None:
     unplugged = "input device 'UMC1820' is not connected"
     seen: set[str | None] = set()
-    with server() as there:
+    with server() as there, listening(tmp_path, reads=True) as manager:
 
         def ask() -> bool:
             seen.add(there.receiver.ingest.problem_of("south"))
+            assert manager.said is not None  # read with each block, before the socket is full
             return False
 
         script = [None] * 15 + [unplugged] * 200 + [None] * 15
         device = Scripted(script, lambda: there.of(Joined))
-        capture_device(there.site, "lab-pc", device, CLOCK, "run-1", ask)
+        service = ServiceManager(HurriedClock(), manager.address, 1_000_000_000)
+        capture_device(there.site, "lab-pc", device, CLOCK, "run-1", ask, service)
         wait_until(lambda: there.of(Left), "the good-bye")
+        assert manager.said[0] == "READY=1"
+        assert manager.count("WATCHDOG=1") >= len(script)
+        states = [line.removeprefix("STATUS=") for line in manager.said if line.startswith("STATUS=")]
+        assert f"connected to the server at {there.receiver.endpoint}" in states
+        without, *_ = (number for number, state in enumerate(states) if state.startswith(f"{unplugged}; "))
+        assert not states[without - 1].startswith(unplugged)
+        assert not states[-2].startswith(unplugged)
+        assert states[-1] == "stopping"
         [left] = there.of(Left)
         assert isinstance(left, Left)
         assert left.hello.problem is None

@@ -196,11 +196,11 @@ def test_blocks_that_were_not_read_in_time_are_counted_and_told(caplog: pytest.L
     with device("report('open'); deliver(130); deliver(10**6, 0.02)") as (entered, runs):
         wait_until(lambda: runs.started[0].overruns >= 30, "overruns")
         blocks, problems = blocks_until(entered, lambda blocks: any(block.overflow for block in blocks))
-        assert entered.overruns >= 30
+        assert entered.losses.overruns >= 30
         assert [block.first_index for block in blocks[:100]] == [160 * k for k in range(100)]
-        assert blocks[-1].first_index == 160 * (100 + entered.overruns)
-    assert entered.lost_blocks == entered.overruns + entered.unflagged_gaps
-    assert f"this machine lags: {entered.overruns} blocks of device 'UMC' were lost" in str(problems[-1])
+        assert blocks[-1].first_index == 160 * (100 + entered.losses.overruns)
+    assert entered.lost_blocks == entered.losses.overruns + entered.losses.unflagged_gaps
+    assert f"this machine lags: {entered.losses.overruns} blocks of device 'UMC' were lost" in str(problems[-1])
     assert "were lost: this node did not read them in time" in caplog.text
 
 
@@ -208,7 +208,7 @@ def test_sound_lost_by_a_busy_machine_and_interruptions_are_counted_apart() -> N
     flagged = "ring.count_flagged(); ring.count_flagged(); deliver(4, 0.02); os._exit(3)"
     with device(f"report('open'); deliver(4, 0.02); {flagged}", DELIVER) as (entered, _):
         blocks_until(entered, lambda blocks: len(blocks) == 12)
-        others = entered.overruns + entered.unflagged_gaps  # this machine may be busy, too
+        others = entered.losses.overruns + entered.losses.unflagged_gaps  # this machine may be busy, too
         assert (entered.lost_blocks - others, entered.interruptions) == (2, 1)
 
 

@@ -124,7 +124,7 @@ def test_gap_that_no_driver_flags_is_found_by_the_time(interfaces: Interfaces, m
         blocks_until(device, lambda blocks: len(blocks) == 30)
         umc.skip(milliseconds)
         blocks = blocks_until(device, lambda blocks: any(block.overflow for block in blocks))
-        assert device.unflagged_gaps == 1
+        assert device.losses.unflagged_gaps == 1
     within = [int(((np.diff(counts_of(block.samples)[0]) - 1) % COUNTED).sum()) for block in blocks]
     assert sum(within) == pytest.approx(48 * milliseconds, abs=2)
 

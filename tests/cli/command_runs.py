@@ -12,8 +12,8 @@ from typing import Any
 from small_site import RATE_HZ
 
 COMMANDS = (
-    "demo", "serve", "hub", "events", "capture", "locate", "replay", "record", "simulate", "evaluate", "bench", "plan",
-    "doctor", "calibrate", "support-bundle", "keys", "init", "check", "config", "devices", "levels",
+    "demo", "serve", "hub", "events", "capture", "locate", "relocate", "replay", "record", "simulate", "evaluate",
+    "bench", "plan", "doctor", "calibrate", "support-bundle", "keys", "init", "check", "config", "devices", "levels",
 )  # fmt: skip
 
 

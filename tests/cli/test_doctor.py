@@ -11,7 +11,9 @@ import pytest
 import soundfile
 
 from cli.command_runs import Recorded, Run
+from livessl.cli.doctor import blind_spot_lines
 from livessl.cli.main import main
+from livessl.core.commission.blind_spots import BlindSpot
 from livessl.core.types import Float32Array
 from small_site import RATE_HZ, hiss, write_site, write_wav
 
@@ -44,7 +46,8 @@ def with_channel(channel: int, factor: float) -> Callable[[Float32Array], Float3
 
 def test_a_good_session_has_no_faults(run: Run, ten_sounds: Recorded) -> None:
     done = run("doctor", "--session", ten_sounds.directory)
-    assert (done.code, done.err) == (0, "")
+    assert done.code == 0
+    assert all("these sounds cannot show whether" in line for line in done.err.splitlines())
     assert done.out == "no fault found in 10 sounds\n"
 
 
@@ -124,3 +127,17 @@ def test_wrong_use_is_told_in_one_line(run: Run, options: list[str], words: str)
     assert done.code == 2
     assert words in done.err
     assert done.err.count("\n") == 1
+
+
+def test_what_the_sounds_hide_is_said_with_its_size_direction_and_cure() -> None:
+    moved, turned = blind_spot_lines(
+        [
+            BlindSpot("moved", ("north", "south"), 0.84, (0.6, 0.8, 0.0)),
+            BlindSpot("turned", ("west",), 12.4, (0.0, 0.0, 1.0)),
+        ]
+    )
+    assert "whether 'north' or 'south' is moved by less than 0.8 m along (0.60, 0.80, 0.00)" in moved
+    assert "whether 'west' is turned by less than 12 degrees about (0.00, 0.00, 1.00)" in turned
+    assert all(
+        line.endswith("clap at places that you know, and run livessl calibrate verify") for line in (moved, turned)
+    )

@@ -284,6 +284,7 @@ def test_wrong_use_is_refused(run: Run, arguments: str, message: str) -> None:
     done = run("levels", *arguments.split())
     assert (done.code, done.out) == (2, "")
     assert message in done.err
+    assert done.err.count("add --listen") <= 1, "a cure is given once"
 
 
 def test_listening_neither_replaces_files_nor_stores_sound_where_that_is_forbidden(run: Run, tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from livessl.core.geometry import (
     circle,
     direction_deg,
     line,
+    pan_tilt_deg,
     posed,
     speed_of_sound_m_s,
     tetrahedron,
@@ -112,6 +113,37 @@ def test_pose_rolls_then_pitches_then_yaws(
 )
 def test_direction_is_azimuth_elevation_distance(target_m: ArrayLike, expected: tuple[float, float, float]) -> None:
     assert direction_deg(np.array([1.0, 2.0, 1.0]), np.asarray(target_m)) == pytest.approx(expected)
+
+
+angles_deg = st.floats(-179.0, 179.0)
+metres = st.floats(-50.0, 50.0)
+
+
+@given(
+    pan_deg=angles_deg,
+    tilt_deg=st.floats(-89.0, 89.0),
+    distance_m=st.floats(0.1, 100.0),
+    position_m=st.tuples(metres, metres, metres),
+    mounted_deg=st.tuples(angles_deg, angles_deg, angles_deg),
+)
+def test_camera_that_pans_and_tilts_so_looks_at_the_place(
+    pan_deg: float,
+    tilt_deg: float,
+    distance_m: float,
+    position_m: tuple[float, float, float],
+    mounted_deg: tuple[float, float, float],
+) -> None:
+    """The place is built by turning the camera: first upwards, then to the right, then as it is mounted."""
+    ahead_m = posed(np.array([[distance_m, 0.0, 0.0]]), np.zeros(3), pitch_deg=-tilt_deg)
+    target_m = posed(posed(ahead_m, np.zeros(3), yaw_deg=-pan_deg), position_m, *mounted_deg)[0]
+    found = pan_tilt_deg(target_m, position_m, *mounted_deg)
+    assert found == pytest.approx((pan_deg, tilt_deg, distance_m), abs=1e-6)
+
+
+def test_camera_pans_to_the_right_and_tilts_upwards() -> None:
+    """One on the wall y = 0 looks into the room along +y."""
+    assert pan_tilt_deg([3.0, 2.0, 2.0], [1.0, 0.0, 2.0], yaw_deg=90.0) == pytest.approx((45.0, 0.0, np.sqrt(8.0)))
+    assert pan_tilt_deg([1.0, 1.0, 1.0], [1.0, 0.0, 2.0], yaw_deg=90.0) == pytest.approx((0.0, -45.0, np.sqrt(2.0)))
 
 
 spans = st.tuples(st.floats(-20.0, 20.0), st.floats(0.0, 9.0)).map(lambda span: (span[0], span[0] + span[1]))

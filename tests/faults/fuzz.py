@@ -1,7 +1,7 @@
 """Coverage-guided fuzzing of the wire: what goes from one line to another for the first time is kept.
 
-The tracer of the interpreter tells which lines of `livessl.wire` a message passes; no other library is needed. What is
-kept is damaged further, so the messages work their way past one check after the other.
+The tracer of the interpreter tells which lines of `livessl.wire` and `livessl.wire_messages` a message passes; no other
+library is needed. What is kept is damaged further, so the messages work their way past one check after the other.
 """
 
 from __future__ import annotations
@@ -12,15 +12,21 @@ import sys
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from types import FrameType
+from types import CodeType, FrameType
 from typing import Any, Final
 
 from mutation import mutated, originals
 
-from livessl import wire
+from livessl import wire, wire_messages
 
-Edge = tuple[int, int, int]
-"""A function's first line, a line of it, and the line before."""
+Function = tuple[str, int]
+"""The file of a function and its first line."""
+
+Edge = tuple[Function, int, int]
+"""A function, a line of it, and the line before."""
+
+TRACED: Final = (wire.__file__, wire_messages.__file__)
+"""The files whose lines are followed."""
 
 Decode = Callable[[bytes], wire.WireMessage]
 
@@ -56,19 +62,17 @@ TOO_LONG: Final = (wire.MAX_JSON_BYTES, wire.MAX_MESSAGE_BYTES)
 MOST_KEPT: Final = 10_000
 """Bytes of a message that is damaged further."""
 
-DECODING: Final = (wire.decode, wire._decode_frame, wire._decode_mark, wire._decode_json, wire._name, wire._unpack)
-"""What takes bytes apart."""
-
 WORD: Final = re.compile(rb'"[^"]*"|-?[0-9.]+|true|false|null|\[[^]]*\]|\{[^{}]*\}')
 """A value or key of JSON."""
 
 
 @dataclass
 class Found:
-    """What came of it: messages tried, edges passed, the messages kept for them, and how often each outcome."""
+    """Result: messages tried, edges passed, functions called, messages kept, and how often there was each outcome."""
 
     tried: int = 0
     edges: set[Edge] = field(default_factory=set)
+    called: dict[Function, CodeType] = field(default_factory=dict)
     kept: list[bytes] = field(default_factory=list)
     outcomes: Counter[str] = field(default_factory=Counter)
 
@@ -92,17 +96,15 @@ def fuzz(count: int, seed: int, decode: Decode = wire.decode) -> Found:
     return found
 
 
-def lines_missed(found: Found) -> list[int]:
-    """The lines that decoding can come to, and has not."""
-    seen = [_frames(function) for function in DECODING]
-    there = {line for lines in seen for line in lines}
-    return sorted(there - {line for _, line, _ in found.edges})
+def lines_missed(found: Found) -> list[tuple[str, int]]:
+    """Return the lines, with their files, of the functions that were called that no message has passed."""
+    seen = {(file, line) for (file, _), line, _ in found.edges}
+    lines = {(file, line) for (file, first), code in found.called.items() for line in _lines(code) if line != first}
+    return sorted(lines - seen)
 
 
-def _frames(function: Callable[..., Any]) -> set[int]:
-    """Lines of a function, but for its head."""
-    code = function.__code__
-    return {line for _, _, line in code.co_lines() if line is not None} - {code.co_firstlineno}
+def _lines(code: CodeType) -> set[int]:
+    return {line for _, _, line in code.co_lines() if line is not None}
 
 
 def _replaced(rng: random.Random, data: bytes) -> bytes:
@@ -118,7 +120,7 @@ def _replaced(rng: random.Random, data: bytes) -> bytes:
 def _try(data: bytes, decode: Decode, found: Found) -> None:
     edges: set[Edge] = set()
     before = sys.gettrace()
-    sys.settrace(_tracer(edges))
+    sys.settrace(_tracer(edges, found.called))
     try:
         message = decode(data)
         outcome = type(message).__name__
@@ -137,17 +139,19 @@ def _try(data: bytes, decode: Decode, found: Found) -> None:
             found.kept.append(data)
 
 
-def _tracer(edges: set[Edge]) -> Callable[[FrameType, str, Any], Any]:
-    """For `sys.settrace`: follows the functions of the wire, and of nothing else."""
+def _tracer(edges: set[Edge], called: dict[Function, CodeType]) -> Callable[[FrameType, str, Any], Any]:
+    """Return a tracer for `sys.settrace` that follows the functions of the wire, and of nothing else."""
 
     def call(frame: FrameType, event: str, value: Any) -> Any:
-        if frame.f_code.co_filename != wire.__file__:
+        code = frame.f_code
+        if code.co_filename not in TRACED:
             return None
-        first, last = frame.f_code.co_firstlineno, 0
+        function, last = (code.co_filename, code.co_firstlineno), 0
+        called[function] = code
 
         def line(frame: FrameType, event: str, value: Any) -> Any:
             nonlocal last
-            edges.add((first, frame.f_lineno, last))
+            edges.add((function, frame.f_lineno, last))
             last = frame.f_lineno
             return line
 

@@ -10,8 +10,9 @@ import sys
 import time
 from collections import defaultdict
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from threading import Thread
 from typing import Any, Final, Self
 
 import httpx
@@ -42,6 +43,8 @@ class Outcome:
     ----------
     kills : int
         Servers that were killed.
+    interrupted : int
+        Kills that met an edit of a zone or rule in progress: it had begun, and was not answered.
     sounds : int
         Events that are stored in the end.
     wanted : frozenset of str
@@ -53,12 +56,13 @@ class Outcome:
     unwanted : list of str
         Events that alerted although they were refused or excluded.
     forgotten : list of str
-        Changes of zones and rules that were answered, and were gone after a kill.
+        Changes of zones and rules that were answered, and were gone after a kill, or that were half made.
     changes : int
         Changes that were answered.
     """
 
     kills: int
+    interrupted: int
     sounds: int
     wanted: frozenset[str]
     accepted: dict[str, int]
@@ -116,9 +120,16 @@ class Forked(Playing):
         self._lives.stdout.close()
 
 
+Zones = dict[str, Any]
+"""The drawn zones, whole, by name."""
+
+SHAPES: Final = ([[3.0, 0.1], [3.9, 0.1], [3.5, 0.9]], [[0.1, 1.1], [0.9, 1.1], [0.9, 1.9], [0.1, 1.9]])
+"""Corners with which a zone is drawn, and those to which it is changed."""
+
+
 @dataclass
 class Operator:
-    """Draws zones and switches a rule; remembers what was answered.
+    """Draws, changes and deletes zones and switches a rule; remembers what was answered and what was under way.
 
     Parameters
     ----------
@@ -126,56 +137,89 @@ class Operator:
     """
 
     site: Forked
-    zones: set[str] = field(default_factory=set)
+    zones: Zones = field(default_factory=dict)
     armed: bool = False
+    edits: int = 0
     changes: int = 0
-    unsure: set[str] = field(default_factory=set)
     forgotten: list[str] = field(default_factory=list)
+    under_way: bool = False
+    begun_s: float = 0.0
+    usual_s: float = 0.05
+    failure: BaseException | None = None
+    _zones: Zones | None = None  # as they are if the edit without an answer was made
+    _armed: bool | None = None  # the same of the rule
 
-    def change(self, number: int) -> None:
-        """Draw a zone or delete the last one, and switch the rule; without an answer both outcomes are possible."""
-        name = f"drawn-{number // 2}"
-        corners = {"polygon_m": [[3.0, 0.1], [3.9, 0.1], [3.5, 0.9]]}
-        if number % 2 == 0:
-            if self._sent("PUT", f"zones/{name}", corners):
-                self.zones.add(name)
-        elif name in self.zones and self._sent("DELETE", f"zones/{name}", None):
-            self.zones.discard(name)
-        if self._sent("PUT", "alerts/rules/switched/armed", {"armed": not self.armed}):
-            self.armed = not self.armed
+    def change(self) -> None:
+        """Make the next edit of a zone, and switch the rule; without an answer both outcomes are possible."""
+        step, name = self.edits % 3, f"drawn-{self.edits // 3}"
+        wanted = {other: zone for other, zone in self.zones.items() if other != name}
+        if step < 2:
+            wanted[name] = SHAPES[step]
+        self.edits += 1
+        self._zones = wanted
+        body = {"polygon_m": SHAPES[step]} if step < 2 else None
+        if step < 2 or name in self.zones:
+            self._send("DELETE" if body is None else "PUT", f"zones/{name}", body)
+        self.zones, self._zones = wanted, None
+        self._armed = not self.armed
+        self._send("PUT", "alerts/rules/switched/armed", {"armed": self._armed})
+        self.armed, self._armed = self._armed, None
+
+    def change_until_killed(self) -> None:
+        """Make one edit after the other until the server does not answer any more."""
+        try:
+            while True:
+                self.change()
+        except httpx.TransportError:
+            return
+        except BaseException as error:  # noqa: BLE001 - it is raised by the thread that plays
+            self.failure = error
+
+    def wait_under_way(self, after_s: float) -> None:
+        """Return while an edit is under way, at the earliest after some time."""
+        at_s = time.monotonic() + after_s
+        while self.failure is None and not (self.under_way and time.monotonic() >= at_s):
+            time.sleep(0.0002)
+        if self.failure is not None:
+            raise self.failure
 
     def check(self) -> None:
-        """Note what was answered before the kill and is not so after it."""
-        there = {name for name in self._get("zones")["zones"] if name.startswith("drawn-")}
+        """Note what was answered before the kill and is not so after it, and what was half made."""
+        found = self._get("zones")["zones"]
+        there = {name: zone["polygon_m"] for name, zone in found.items() if name.startswith("drawn-")}
         rules = {rule["name"]: rule["armed"] for rule in self._get("alerts/rules")["rules"]}
-        if "zones" not in self.unsure and there != self.zones:
-            self.forgotten.append(f"zones are {sorted(there)}, expected {sorted(self.zones)}")
-        if "alerts" not in self.unsure and rules["switched"] != self.armed:
+        zones = [self.zones] if self._zones is None else [self.zones, self._zones]
+        if there not in zones:
+            self.forgotten.append(f"zones are {there}, expected one of {zones}")
+        if not {"door", "fan"} <= found.keys() or not found["fan"]["exclude"]:
+            self.forgotten.append(f"of the site file's zones, {sorted(found)} are left")
+        if rules["switched"] not in (self.armed, self._armed):
             self.forgotten.append(f"the rule is {rules['switched']}, expected {self.armed}")
         self.zones, self.armed = there, rules["switched"]
-        self.unsure.clear()
+        self._zones = self._armed = None
 
     def _get(self, what: str) -> Any:
         answer = httpx.get(f"http://127.0.0.1:{self.site.http}/api/v1/{what}", timeout=WITHIN_S)
         answer.raise_for_status()
         return answer.json()
 
-    def _sent(self, method: str, what: str, body: Any) -> bool:
-        try:
-            url = f"http://127.0.0.1:{self.site.http}/api/v1/{what}"
-            httpx.request(method, url, json=body, timeout=WITHIN_S).raise_for_status()
-        except httpx.TransportError:
-            self.unsure.add(what.partition("/")[0])
-            return False
+    def _send(self, method: str, what: str, body: Any) -> None:
+        url = f"http://127.0.0.1:{self.site.http}/api/v1/{what}"
+        with httpx.Client(timeout=WITHIN_S) as client:
+            request = client.build_request(method, url, json=body)
+            self.begun_s, self.under_way = time.monotonic(), True
+            client.send(request).raise_for_status()
+            self.under_way = False
+        self.usual_s = time.monotonic() - self.begun_s
         self.changes += 1
-        return True
 
 
 def play_killed(recordings: Path, directory: Path, kills: int, seed: int) -> Outcome:
     """Play recordings to a server that is killed again and again; let it finish, and return what arrived.
 
-    A life lasts until none, one or two deliveries have been tried, and then up to half a second longer: on a slow
-    machine a server that is killed sooner never comes to an event.
+    Every second kill comes while an edit of the operator is under way, the others soon after one was answered. A life
+    lasts until none, one or two deliveries have been tried, and then up to half a second longer: on a slow machine a
+    server that is killed sooner never comes to an event.
     """
     chance, end_s = random.Random(seed), duration_s(recordings)
     with ExitStack() as stack:
@@ -186,25 +230,41 @@ def play_killed(recordings: Path, directory: Path, kills: int, seed: int) -> Out
         changes = {"alerts": alerts, "zones.fan": FAN, "zones_file": "zones.yaml"}
         site = stack.enter_context(Forked(recordings, directory, seed=seed, changes=changes))
         site.start()
-        operator, killed = Operator(site), 0
+        operator, killed, interrupted = Operator(site), 0, 0
         site.sleep_until(0.5)
-        while killed < kills:
+        while killed < kills or interrupted == 0:
             wanted = len(receiver.requests) + chance.choice((0, 1, 1, 2))
             give_up_s = time.monotonic() + WITHIN_S
             while len(receiver.requests) < wanted and time.monotonic() < give_up_s and site.now_s() < end_s:
                 time.sleep(0.02)
             time.sleep(chance.uniform(0.0, 0.5))
-            operator.change(killed)
-            time.sleep(chance.uniform(0.0, 0.05))
-            site.kill_server()
+            operator.change()
+            if killed % 2 == 0 or killed >= kills:
+                interrupted += operator_interrupted(site, operator, chance.uniform(0.0, 2.0 * operator.usual_s))
+            else:
+                time.sleep(chance.uniform(0.0, 0.05))
+                site.kill_server()
             killed += 1
             site.start_server()
             site.wait_ready(WITHIN_S)
             operator.check()
-        return _finished(site, receiver, operator, killed, end_s)
+        outcome = _finished(site, receiver, operator, end_s)
+        return replace(outcome, kills=killed, interrupted=interrupted)
 
 
-def _finished(site: Forked, receiver: Receiver, operator: Operator, kills: int, end_s: float) -> Outcome:
+def operator_interrupted(site: Forked, operator: Operator, after_s: float) -> bool:
+    """Kill the server while an edit is under way; return whether it was still without an answer."""
+    editing = Thread(target=operator.change_until_killed)
+    editing.start()
+    operator.wait_under_way(after_s)
+    killed_s = time.monotonic()
+    site.kill_server()
+    editing.join(WITHIN_S)
+    assert not editing.is_alive(), "an edit of a killed server does not end"
+    return operator.begun_s < killed_s
+
+
+def _finished(site: Forked, receiver: Receiver, operator: Operator, end_s: float) -> Outcome:
     site.sleep_until(end_s + 1.0)
     wait_for(lambda: all(site.is_settled() for _ in range(3)), "the last events", 2.0 * WITHIN_S)
     messages = AlertMessages(load_site(site.site), "")
@@ -219,7 +279,8 @@ def _finished(site: Forked, receiver: Receiver, operator: Operator, kills: int, 
         bodies[request.key].add(request.body)
     about = [request.alert["event"] for request in requests]
     return Outcome(
-        kills=kills,
+        kills=0,
+        interrupted=0,
         sounds=len(events),
         wanted=wanted,
         accepted={key: receiver.keys.count(key) for key in set(receiver.keys)},

@@ -1,4 +1,7 @@
-"""The whole server, killed at random moments: every alert arrives, and every change that was answered is kept."""
+"""The whole server, killed at random moments: every alert arrives, and changes are kept whole.
+
+A change that was answered is there; one that was under way is made or not made, and nothing in between.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +24,8 @@ def test_alerts_and_changes_survive_kills_of_the_whole_server(tmp_path: Path) ->
     make_recordings(tmp_path / "recordings", SOUNDS, gap_s=1.2)
     outcome = play_killed(tmp_path / "recordings", tmp_path / "site", KILLS, seed)
     print(outcome)
-    assert outcome.kills == KILLS
+    assert outcome.kills >= KILLS
+    assert outcome.interrupted > 0
     assert outcome.sounds == SOUNDS
     assert 0 < len(outcome.wanted) < SOUNDS, "some sounds are in the excluded zone, and some are not"
     assert outcome.missing == []

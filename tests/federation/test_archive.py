@@ -250,6 +250,19 @@ def test_states_tracks_and_alerts_follow_the_messages(archive: Archive) -> None:
     assert archive.tracks("lab") == archive.arrays("lab") == []  # a server that starts reports all that it has
 
 
+def test_newest_reports_of_sites_are_kept_and_one_that_is_refused_holds_up_no_other(
+    archive: Archive, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A lone surrogate is a name that no database stores; NATS lets no such subject pass."""
+    archive.take([delivery(1)], PATIENCE_S)
+    archive.note_reports({})
+    archive.note_reports({"lab": {"waiting": 3}, "yard": {"waiting": 4}})
+    archive.note_reports({"yard": {"waiting": 5, "version": "9"}, "a\ud800": {"waiting": 6}, "hall": {"waiting": 7}})
+    assert {site["site"]: site["waiting"] for site in archive.sites()} == {"hall": 7, "lab": 3, "yard": 5}
+    assert [site["version"] for site in archive.sites() if site["site"] == "yard"] == ["9"]
+    assert "a report is left out" in caplog.text
+
+
 def test_old_events_and_alerts_are_deleted(archive: Archive) -> None:
     alert = {"kind": "alert", "key": "old", "raised_utc": event(1)["time_utc"]}
     newer = {"kind": "alert", "key": "new", "raised_utc": event(3)["time_utc"]}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections import deque
 from collections.abc import Iterator
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,10 +27,31 @@ from livessl.federation.archive import Archive
 from livessl.federation.intake import BATCH, Intake, RefusedError
 from livessl.federation.standstill import STANDSTILL_S, Standstill
 from livessl.server.forwarding.outbox import Outgoing
-from livessl.server.forwarding.stream import STREAM, connect_options, connected, first_number, outbox_name
+from livessl.server.forwarding.stream import STREAM, connect_options, connected, ended, first_number, outbox_name
 from livessl.site.hub_models import NatsConfig
 from nats_servers import NatsServer, running_nats
 from small_site import wait_until
+
+
+@pytest.mark.parametrize("deaf", [0, 1, 3])
+def test_tasks_end_although_they_lose_cancellations(deaf: int) -> None:
+    async def goes_on() -> None:
+        for _ in range(deaf):
+            with suppress(asyncio.CancelledError):
+                await asyncio.sleep(1000)
+        await asyncio.sleep(1000)
+
+    async def fails() -> None:
+        raise LookupError
+
+    async def work() -> None:
+        tasks = [asyncio.create_task(each) for each in (goes_on(), asyncio.sleep(0), fails())]
+        await asyncio.sleep(0)
+        await ended(*tasks)
+        assert all(task.done() for task in tasks)
+        assert isinstance(tasks[-1].exception(), LookupError)
+
+    asyncio.run(work())
 
 
 class Waiting:

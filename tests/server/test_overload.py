@@ -69,11 +69,12 @@ def test_overload_is_reported_with_figures_and_cure_and_its_end_too(caplog: pyte
     figures = load.overload.describe()
     assert figures["state"] == "overloaded"
     assert figures["since_utc"].startswith("2026-01-01T00:00:")
-    assert figures["shed"] == ["updates", "maps", "arrays", "quiet"]
+    assert figures["shed"] == ["updates", "second_looks", "maps", "arrays", "quiet"]
     assert figures["delay_s"] == pytest.approx(0.2)
     assert figures["message"] == (
         "overloaded: sound waited up to 0.20 s, and the fusion works 100 % of the time on 400 messages a second; it "
-        f"sheds some updates, power maps, arrays with the least evidence and frames of quiet. {CURE}"
+        "sheds some updates, second looks at doubtful sounds, power maps, arrays with the least evidence and frames of "
+        f"quiet. {CURE}"
     )
     load.turns(3000, 0.0, waited=0.9)
     assert load.overload.message is None
@@ -89,6 +90,7 @@ def test_updates_that_would_come_too_late_are_left_out_under_overload_only() -> 
     assert load.overload.relief == NOTHING_SHED
     load.turns(40, 2.0 * PROMPT_S)
     assert load.overload.relief.update_every is None
+    assert not load.overload.relief.second_looks
     load.turns(1, 0.0)
     level = load.overload.describe()["level"]
     assert level > 0

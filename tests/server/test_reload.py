@@ -22,7 +22,8 @@ from livessl.core.stream.final_pass import FinalResults
 from livessl.core.types import Event, FloatArray
 from livessl.errors import ConfigError, RunError
 from livessl.server.alerts import service
-from livessl.server.alerts.outbox import DeliveryState
+from livessl.server.alerts.in_force import AlertsInForce, Surroundings
+from livessl.server.alerts.outbox import DeliveryState, Outbox
 from livessl.server.api.encode import Messages
 from livessl.server.app import Server
 from livessl.server.reload import Reloader
@@ -31,6 +32,7 @@ from livessl.site.load import load_site
 from livessl.site.models import Site
 from livessl.site.tokens import add_token
 from livessl.site.zone_models import Zone
+from notify_socket import listening
 from small_site import HANG_S, SMALL, Changes, running_server, site_of, started, wait_until, write_site
 from webhook_receiver import running_receiver
 
@@ -95,25 +97,31 @@ def test_change_that_is_reported_as_refused_is_not_made_later(tmp_path: Path, mo
     """The thread that judges is busy for longer than the reload waits."""
     site = alert_site(tmp_path, rules={"door": DOOR})
     other = site.alerts.model_copy(update={"rules": {}})
-    with running_desk(site) as desk:
-        loop, busy, free, later = desk.alerts._loop, Flag(), Flag(), Flag()
-        assert loop is not None
+    made: list[object] = []
 
-        def work() -> None:
+    class Noted(AlertsInForce):
+        def __init__(self, site: Site, outbox: Outbox, around: Surroundings) -> None:
+            made.append(site.alerts)
+            super().__init__(site, outbox, around)
+
+    with running_desk(site) as desk:
+        busy, free = Flag(), Flag()
+
+        def work(_: object) -> None:
             busy.set()
             free.wait(HANG_S)
 
-        loop.call_soon_threadsafe(work)
+        desk.on_alert = work
+        desk.finish(sound(1))
         assert busy.wait(HANG_S)
+        monkeypatch.setattr(service, "AlertsInForce", Noted)
         monkeypatch.setattr(service, "TAKE_OVER_S", 0.01)
         with pytest.raises(RunError, match="the former rules stay in force; reload again later"):
             desk.alerts.take_over(other)
         free.set()
-        loop.call_soon_threadsafe(loop.call_soon, loop.call_soon, later.set)
-        assert later.wait(HANG_S)
-        assert desk.alerts.config == site.alerts
         monkeypatch.setattr(service, "TAKE_OVER_S", HANG_S)
-        desk.alerts.take_over(other)
+        desk.alerts.take_over(other)  # the thread comes to this change after the one that was given up
+        assert made == [other]
         assert desk.alerts.config == other
 
 
@@ -306,7 +314,11 @@ def test_hang_up_signal_reloads_and_a_broken_file_is_reported_while_the_server_r
     path = write_site(tmp_path)
     log = tmp_path / "log"
     words = (sys.executable, "-m", "livessl", "--log", "json", "serve", "--site", path)
-    with log.open("w") as stderr, started(*words, stderr=stderr) as process:
+    with (
+        listening(tmp_path, reads=True) as manager,
+        log.open("w") as stderr,
+        started(*words, stderr=stderr, env=manager.environment(silence_s=4.0)) as process,
+    ):
 
         def lines() -> list[dict[str, Any]]:
             return [json.loads(line) for line in log.read_text().splitlines(keepends=True) if line.endswith("\n")]
@@ -318,7 +330,10 @@ def test_hang_up_signal_reloads_and_a_broken_file_is_reported_while_the_server_r
             wait_until(lambda: is_there() or process.poll() is not None, text)
             assert process.poll() is None, log.read_text()
 
-        wait_until(lambda: "dashboard on http" in log.read_text() or process.poll() is not None, "the server")
+        wait_until(lambda: manager.count("READY=1") or process.poll() is not None, "the server")
+        found = re.search(r"dashboard on (http://[\d.:]+)", log.read_text())
+        assert found is not None
+        assert httpx.get(f"{found[1]}/api/v1/health").status_code == 200, "it is ready"
         write_site(tmp_path, {"zones.centre": CENTRE, "fusion.min_arrays": 2})
         process.send_signal(signal.SIGHUP)
         logged("the site file was read again: zones.centre took effect; fusion.min_arrays needs a restart")
@@ -330,6 +345,10 @@ def test_hang_up_signal_reloads_and_a_broken_file_is_reported_while_the_server_r
         write_site(tmp_path)
         process.send_signal(signal.SIGHUP)
         logged("the site file was read again: zones.centre took effect")
+        wait_until(lambda: manager.count("READY=1") == 4, "the end of the reload")
+        wait_until(lambda: manager.count("WATCHDOG=1") > 1, "a sign of life")
         process.terminate()
         assert process.wait(HANG_S) == 0
+        states = [line for line in manager.said if line in ("READY=1", "RELOADING=1", "STOPPING=1")]
+        assert states == ["READY=1", *["RELOADING=1", "READY=1"] * 3, "STOPPING=1"]
         assert {line["command"] for line in lines()} == {"serve"}

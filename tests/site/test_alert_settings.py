@@ -68,6 +68,8 @@ def action(**keys: Any) -> dict[str, Any]:
         (action(mqtt={"topic": "yard/#"}), "expected a topic without '#'"),
         (action(mqtt={"password": "file"}), "password needs username; add it"),
         (action(command=[]), "expected at least 1 item"),
+        ({"links": {"lifetime_s": 5}}, "links.lifetime_s: expected a value greater than or equal to 60, got 5"),
+        ({"links": {"of": ["clips"]}}, "expected 'picture' or 'clip', got 'clips'"),
         (span(days=[]), "days: expected at least 1 item, got none; leave the key out for the default"),
     ],
 )

@@ -28,7 +28,7 @@ class Device(Protocol):
 
     @property
     def through_sound_server(self) -> bool:
-        """Whether samples come through a sound server or plug-in, whose times do not show the device's clock."""
+        """True if samples come through a sound server or plug-in, whose times do not show the device's clock."""
         ...
 
     def __enter__(self) -> Self: ...

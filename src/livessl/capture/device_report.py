@@ -108,7 +108,7 @@ class Report:
 
 
 class OpeningError(Exception):
-    """Why a device cannot be opened now.
+    """Reason why a device cannot be opened now.
 
     Parameters
     ----------

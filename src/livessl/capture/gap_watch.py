@@ -16,8 +16,8 @@ class GapRule:
     recent_s : float
         Length of the recent window, in seconds: longer than a busy machine delays blocks.
     before_s : float
-        Length of the window before it, in seconds: so short that a crystal off by 500 ppm moves by much less than
-        `least_gap_ns` in both.
+        Length of the window before it, in seconds: so short that a clock that is off by 500 ppm drifts by much
+        less than `least_gap_ns` over both windows.
     least_gap_ns : int
         Shortest gap that is found, in ns.
     """
@@ -40,7 +40,7 @@ LEAST_BLOCKS: Final = 5
 
 
 class GapWatch:
-    """Compares the earliest stamps of two windows, because a stamp can be late but not early.
+    """Compares the earliest stamps of two windows: a stamp can be late, never early.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ class GapWatch:
     def push(self, first_index: int, time_ns: int) -> int:
         """Take in a block; return the length of a gap in ns that began within the recent window, 0 if there is none.
 
-        The length is short by as much as the blocks before the gap were late.
+        The length comes out too short by the delay of the blocks before the gap.
 
         Parameters
         ----------

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Final
 
 from livessl import wire
@@ -20,6 +21,7 @@ from livessl.errors import RunError
 from livessl.recordings.assign import AssignedRecording, make_pipelines
 from livessl.recordings.play import paced_messages
 from livessl.recordings.recording import TimedRecording
+from livessl.service_manager import ServiceManager
 from livessl.site.build.pipeline import make_pipeline
 from livessl.site.keys import node_keys
 from livessl.site.models import Site
@@ -56,8 +58,20 @@ Stop = Callable[[], bool]
 Progress = Callable[[int], None]
 
 
-def capture_device(site: Site, name: str, device: Device, clock: Clock, run_id: str, stop: Stop) -> None:
-    """Run a node on its audio device until `stop()`, through any interruption of device or server."""
+def capture_device(
+    site: Site,
+    name: str,
+    device: Device,
+    clock: Clock,
+    run_id: str,
+    stop: Stop,
+    service: ServiceManager | None = None,
+) -> None:
+    """Run a node on its audio device until `stop()`, through any interruption of device or server.
+
+    `service`, if there is one, gets a report with each block: the node is ready when its device delivers, or when it
+    waits for it.
+    """
     config: NodeConfig = site.nodes[name]
     pipeline = make_pipeline(site, config.arrays, device.sample_rate_hz, reports_levels=True)
     link = _link(site, name, config.server, [pipeline], clock, run_id, _spool(site, name))
@@ -67,6 +81,8 @@ def capture_device(site: Site, name: str, device: Device, clock: Clock, run_id: 
             for block in device:
                 if stop():
                     break
+                if service is not None:
+                    service.turn(partial(_in_words, link, device.problem))
                 if device.problem != problem:
                     problem = device.problem
                     _log.warning("%s", problem or f"device {device.name!r} delivers sound again")
@@ -75,6 +91,8 @@ def capture_device(site: Site, name: str, device: Device, clock: Clock, run_id: 
                     with_host(pipeline.push(block), host, device.lost_blocks, sound_server=device.through_sound_server)
                 )
     finally:
+        if service is not None:
+            service.stopping()
         link.close(bye=True)
 
 
@@ -86,8 +104,9 @@ def capture_recordings(
     run_id: str,
     stop: Stop,
     progress: Progress | None = None,
+    service: ServiceManager | None = None,
 ) -> None:
-    """Run a node on recordings, at the pace of `clock`, to their end.
+    """Run a node on recordings, at the pace of `clock`, to their end; `service`, if there is one, gets reports.
 
     Raises
     ------
@@ -100,8 +119,12 @@ def capture_recordings(
     link = _link(site, name, site.nodes[name].server, pipelines, clock, run_id, _spool(site, name))
     with HostWatch() as host:
         for end_ns in _sent(link, pipelines, inputs, clock, stop, host):
+            if service is not None:
+                service.turn(partial(_in_words, link))
             if progress is not None:
                 progress(end_ns)
+    if service is not None:
+        service.stopping()
     _finish(link, clock, stop)
 
 
@@ -242,6 +265,17 @@ def _finish(link: Link, clock: Clock, stop: Stop) -> None:
         raise UndeliveredError(
             f"{undelivered} messages were never acknowledged by the server at {link.endpoint}; is one running there?"
         )
+
+
+def _in_words(link: Link, problem: str | None = None) -> str:
+    """Return the state of a node: the problem of its device if there is one, and whether the server takes its sound."""
+    if link.refused is not None:
+        server = f"the server at {link.endpoint} refuses this node: {link.refused}"
+    elif link.connected:
+        server = f"connected to the server at {link.endpoint}"
+    else:
+        server = f"no answer of the server at {link.endpoint}; {link.kept} frames wait for it"
+    return server if problem is None else f"{problem}; {server}"
 
 
 def _pause(link: Link, clock: Clock) -> None:

@@ -25,8 +25,8 @@ MEMORY_BYTES: Final = 64 * 1024 * 1024
 """Limit, in bytes, on frames kept in memory (no folder, or its disk is full): about 30 s of six arrays."""
 
 SEGMENT_BYTES: Final = 4 * 1024 * 1024
-"""Size of a segment in bytes, a few seconds of sound: the unit of deletion, and the most that a restarted node sends
-twice."""
+"""Size of a segment in bytes, a few seconds of sound. Whole segments are deleted, so a restarted node sends at most one
+segment twice."""
 
 _MAGIC: Final = b"LSSLspl1"
 _RECORD: Final = struct.Struct("<II")
@@ -103,7 +103,7 @@ class Spool:
     def append(self, frame: Frame) -> tuple[Kept, list[Kept]]:
         """Add a frame; return it as it is kept, and the frames that were removed.
 
-        Kept frames of this array with the same or a later time are removed: the clock has been set back since.
+        Kept frames of this array with the same or a later time are removed: then the clock was set back.
         """
         removed = self._clear_from(frame)
         data = wire.encode(frame)

@@ -45,28 +45,14 @@ REFINED_SOUNDS: Final = 20
 def add_arguments(parser: Any) -> None:
     """Describe the command's arguments."""
     actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
+    _add_verify(actions)
+    _add_poses(actions)
+    _add_refine(actions)
 
-    def action(name: str, act: Callable[[argparse.Namespace], int], text: str, example: str) -> Any:
-        sub = actions.add_parser(
-            name,
-            help=text,
-            description=f"{text[0].upper()}{text[1:]}. To use a running server, give its site file (--site) or its "
-            "address (--url); the command then prompts for each clap. To use recordings, give --session or --wav.",
-            epilog=f"example: livessl calibrate {example}",
-        )
-        sub.set_defaults(act=act)
-        add_recordings(sub)
-        add_server(sub, "the command prompts for each clap and waits for it")
-        sub.add_argument(
-            "--wait",
-            type=argument.above_zero,
-            default=WAIT_S,
-            metavar="S",
-            help=f"longest wait for each sound of a running server, seconds (default {WAIT_S:g})",
-        )
-        return sub
 
-    sub = action(
+def _add_verify(actions: Any) -> None:
+    sub = _action(
+        actions,
         "verify",
         _verify,
         "print the error of claps at places that you know, and its likely cause",
@@ -74,7 +60,11 @@ def add_arguments(parser: Any) -> None:
     )
     _add_places(sub, "place of a clap in metres; repeat for each, in the order in which they are made")
     add_json(sub, "print one JSON object for each clap and each finding")
-    sub = action(
+
+
+def _add_poses(actions: Any) -> None:
+    sub = _action(
+        actions,
         "poses",
         _poses,
         "measure where the arrays are, by claps at places that you know",
@@ -92,7 +82,11 @@ def add_arguments(parser: Any) -> None:
     )
     add_calibration_file(sub)
     add_json(sub, "print one JSON object for each clap, each array and the speed of sound")
-    sub = action(
+
+
+def _add_refine(actions: Any) -> None:
+    sub = _action(
+        actions,
         "refine",
         _refine,
         "use sounds at unknown places to measure the arrays' poses; one array's pose must be right",
@@ -122,6 +116,27 @@ def add_arguments(parser: Any) -> None:
     )
     add_calibration_file(sub)
     add_json(sub, "print one JSON object for each array and the speed of sound")
+
+
+def _action(actions: Any, name: str, act: Callable[[argparse.Namespace], int], text: str, example: str) -> Any:
+    sub = actions.add_parser(
+        name,
+        help=text,
+        description=f"{text[0].upper()}{text[1:]}. To use a running server, give its site file (--site) or its "
+        "address (--url); the command then prompts for each clap. To use recordings, give --session or --wav.",
+        epilog=f"example: livessl calibrate {example}",
+    )
+    sub.set_defaults(act=act)
+    add_recordings(sub)
+    add_server(sub, "the command prompts for each clap and waits for it")
+    sub.add_argument(
+        "--wait",
+        type=argument.above_zero,
+        default=WAIT_S,
+        metavar="S",
+        help=f"longest wait for each sound of a running server, seconds (default {WAIT_S:g})",
+    )
+    return sub
 
 
 def _add_places(parser: Any, text: str) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 from livessl.cli import argument, progress
 from livessl.cli.exits import OK, stop_on_signal
 from livessl.cli.options import add_joint, add_site, add_wav, read_site
+from livessl.cli.service import service_manager
 from livessl.clock import SystemClock
 from livessl.garbage import collect_as_usual, collect_seldom
 from livessl.traces import traced
@@ -32,6 +33,7 @@ def add_arguments(parser: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
     collect_seldom()
+    service = service_manager()
     from livessl.capture.node import capture_device, capture_recordings
     from livessl.cli.node_input import audio_device, check_files, node_config, recordings, run_id
     from livessl.recordings.assign import span_ns
@@ -45,10 +47,10 @@ def run(arguments: argparse.Namespace) -> int:
     collect_as_usual()
     if device is not None:
         with stop_on_signal() as stop, traced("livessl-node", arguments.node):
-            capture_device(site, arguments.node, device, clock, name, stop.is_set)
+            capture_device(site, arguments.node, device, clock, name, stop.is_set, service)
         return OK
     parts = recordings(arguments, site, clock.now_ns())
     traces = traced("livessl-node", arguments.node)
     with stop_on_signal() as stop, traces, progress.timed("playing", *span_ns(parts)) as bar:
-        capture_recordings(site, arguments.node, parts, clock, name, stop.is_set, bar)
+        capture_recordings(site, arguments.node, parts, clock, name, stop.is_set, bar, service)
     return OK

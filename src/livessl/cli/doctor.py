@@ -16,6 +16,9 @@ from livessl.cli.server_answers import add_server, ask
 from livessl.errors import UseError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from livessl.core.commission.blind_spots import BlindSpot
     from livessl.core.commission.finding import Finding
     from livessl.examination import Examination
     from livessl.recordings.assign import AssignedRecording
@@ -35,7 +38,7 @@ def add_recordings(parser: Any) -> None:
     parser.add_argument(
         "--session", action="append", type=Path, default=[], metavar="DIR", help="recorded session; repeatable"
     )
-    add_wav(parser, "recording of an array, in place of --session, WAV or FLAC; repeat for each array")
+    add_wav(parser, "WAV or FLAC recording of one array, instead of --session; repeat for each array")
     add_joint(parser)
 
 
@@ -56,7 +59,9 @@ def run(arguments: argparse.Namespace) -> int:
         )
     elif not examination.findings and not arguments.json:
         print(f"no fault found in {_count(examination.sounds)}")
-    return OK if examination.is_sound else FAILED
+    for line in blind_spot_lines(examination.blind_spots):
+        complain(line, kind="note")
+    return OK if examination.is_faultless else FAILED
 
 
 def _examine(arguments: argparse.Namespace) -> Examination:
@@ -83,7 +88,7 @@ def _ask(url: str, token_file: Path | None) -> Examination:
 def recordings_given(
     arguments: argparse.Namespace, command: str, otherwise: str = ""
 ) -> tuple[Site, list[AssignedRecording], tuple[int, int | None]]:
-    """Return the site and the recordings that --session, or --site and --wav, name, and their span in nanoseconds."""
+    """Return the site, the recordings given by --session, or --site and --wav, and the time that they span in ns."""
     from livessl.recordings.assign import assign_files, assign_sessions, span_ns
     from livessl.recordings.session import read_session
     from livessl.site.load import load_site
@@ -112,6 +117,22 @@ def finding_line(finding: Finding) -> str:
         f"{finding.severity:<8} {finding.fault:<12} {finding.message}{where}; {finding.cure}  "
         f"[{100 * finding.confidence:.0f} % sure]"
     )
+
+
+def blind_spot_lines(spots: Sequence[BlindSpot]) -> list[str]:
+    """Return a line for each fault that the sounds could not have shown."""
+    lines = []
+    for spot in spots:
+        names = " or ".join(repr(name) for name in spot.arrays)
+        along = ", ".join(f"{x:.2f}" for x in spot.along)
+        how = f"moved by less than {spot.least:.1f} m along ({along})"
+        if spot.fault == "turned":
+            how = f"turned by less than {spot.least:.0f} degrees about ({along})"
+        lines.append(
+            f"these sounds cannot show whether {names} is {how}; clap at places that you know, and run livessl "
+            "calibrate verify"
+        )
+    return lines
 
 
 def _count(sounds: int) -> str:

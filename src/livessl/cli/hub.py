@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from livessl.cli.exits import OK
+from livessl.cli.service import service_manager
 from livessl.clock import SystemClock
 
 
@@ -20,10 +21,11 @@ def add_arguments(parser: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
+    service = service_manager()
     from livessl.federation.app import HubServer
     from livessl.federation.config import load_hub
 
-    server = HubServer(load_hub(arguments.config), SystemClock())
+    server = HubServer(load_hub(arguments.config), SystemClock(), service)
     logging.info("hub on %s", server.url)
     try:
         server.run()

@@ -70,7 +70,7 @@ def _check(arguments: argparse.Namespace) -> Site | None:
     if arguments.inputs is not None and arguments.wav is not None:
         faults.append(Fault("--inputs", "applies to a device only; remove it"))
     if arguments.out is not None and arguments.listen is None:
-        faults.append(Fault("--out", "needs --listen; add --listen CH, or remove --out; add --listen CH, or remove it"))
+        faults.append(Fault("--out", "needs --listen; add --listen CH, or remove --out"))
     if arguments.listen is not None and arguments.out.exists():
         faults.append(Fault(f"--out {arguments.out}", "expected a new file, but it exists; choose another name"))
     if faults:

@@ -49,6 +49,11 @@ COMMANDS: Final = (
         "locate the sounds in recordings",
         "livessl locate --site site.yaml --wav north=north.wav --wav south=south.wav",
     ),
+    Command(
+        "relocate",
+        "locate stored events again from their recordings, by another method or calibration",
+        "livessl relocate --site site.yaml --method srp-phat --out srp-phat.jsonl",
+    ),
     Command("replay", "play a recorded session through a server", "livessl replay session/ --speed 2"),
     Command("record", "record a session for replay", "livessl record --site site.yaml --node lab-pc --out session/"),
     Command(

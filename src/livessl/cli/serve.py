@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from livessl.cli.exits import OK, on_hang_up
 from livessl.cli.options import add_joint, add_method, add_site, import_from_here, read_site
 from livessl.cli.output import print_warnings
+from livessl.cli.service import service_manager
 from livessl.clock import SystemClock
 from livessl.garbage import collect_seldom
 from livessl.traces import traced
@@ -28,6 +29,7 @@ def add_arguments(parser: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
     collect_seldom()
+    service = service_manager()
     from livessl.server.app import Server
 
     import_from_here()
@@ -35,7 +37,9 @@ def run(arguments: argparse.Namespace) -> int:
     print_warnings(site)
     requests: queue.SimpleQueue[None] = queue.SimpleQueue()  # a signal that comes too early must not end the process
     with on_hang_up(lambda: requests.put(None)), traced("livessl-server", site.site):
-        server = Server(site, SystemClock(), method=arguments.method, read_site=lambda: read_site(arguments))
+        server = Server(
+            site, SystemClock(), method=arguments.method, read_site=lambda: read_site(arguments), service=service
+        )
         logging.info("listening for nodes on %s, dashboard on %s", server.endpoint, server.url)
         with on_hang_up(server.parts.reloader.request):
             if not requests.empty():

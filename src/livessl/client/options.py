@@ -1,4 +1,4 @@
-"""What a client asks for."""
+"""Options of a subscription."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Options(TypedDict, total=False):
     min_confidence: float
     """Least confidence of events and updates, 0 to 1."""
     track: int
-    """Of tracks and their changes in zones, only those of this track."""
+    """Number of the only track whose states and changes in zones are wanted."""
     max_rate_hz: float
     """Most updates of a sound, states of a track, and states of the arrays a second."""
     since: datetime | str
@@ -35,7 +35,7 @@ class Options(TypedDict, total=False):
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """What a client subscribes to.
+    """The messages that a client subscribes to.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What a client does with its connections, as steps that somebody else carries out: it knows no socket.
+"""Steps by which a client receives, catches up and resumes. Others carry them out: this module knows no socket.
 
 `conversation` is a generator of steps for one connection, and `Memory` is what outlives the connection. Events come
 over the WebSocket, and after every new connection also from the server's log of stored events; each is delivered once.
@@ -62,7 +62,7 @@ Received = (
     | ZonesMessage
     | Gap
 )
-"""What a client delivers. An event is an `EventMessage` if it came live, and an `Event` if it was missed."""
+"""Values that a client delivers. An event is an `EventMessage` if it came live, and an `Event` if it was missed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +92,7 @@ Steps = Generator[Get | Receive | Deliver, str | bytes | None, None]
 
 @dataclass(slots=True)
 class Memory:
-    """What a client knows beyond one connection."""
+    """Knowledge of a client that outlives one connection."""
 
     last_seq: int | None = None
     """Number of the last message received."""

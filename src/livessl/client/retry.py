@@ -1,4 +1,4 @@
-"""When a client connects again: waits that grow, and an end to its patience if the user wants one."""
+"""Waits before a client connects again: they grow, and end if the user gave a limit."""
 
 from __future__ import annotations
 

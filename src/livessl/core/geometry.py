@@ -95,12 +95,18 @@ def posed(
     yaw_deg, pitch_deg, roll_deg : float
         Degrees. Yaw is counter-clockwise seen from above; a positive pitch lowers the +x end.
     """
+    turned_m = shape_m @ rotation(yaw_deg, pitch_deg, roll_deg).T
+    return np.asarray(turned_m + np.asarray(position_m, dtype=np.float64))
+
+
+def rotation(yaw_deg: float, pitch_deg: float, roll_deg: float) -> FloatArray:
+    """Matrix (3, 3) that turns column vectors: roll about x, then pitch about y, then yaw about z (right-hand rule)."""
     cos_y, cos_p, cos_r = np.cos(np.radians([yaw_deg, pitch_deg, roll_deg]))
     sin_y, sin_p, sin_r = np.sin(np.radians([yaw_deg, pitch_deg, roll_deg]))
     yaw = np.array([[cos_y, -sin_y, 0.0], [sin_y, cos_y, 0.0], [0.0, 0.0, 1.0]])
     pitch = np.array([[cos_p, 0.0, sin_p], [0.0, 1.0, 0.0], [-sin_p, 0.0, cos_p]])
     roll = np.array([[1.0, 0.0, 0.0], [0.0, cos_r, -sin_r], [0.0, sin_r, cos_r]])
-    return np.asarray(shape_m @ (yaw @ pitch @ roll).T + np.asarray(position_m, dtype=np.float64))
+    return np.asarray(yaw @ pitch @ roll)
 
 
 def angle_deg(one: FloatArray, other: FloatArray) -> float:
@@ -117,6 +123,27 @@ def direction_deg(origin_m: FloatArray, target_m: FloatArray) -> tuple[float, fl
         float(np.degrees(np.arctan2(z, horizontal))),
         float(np.hypot(horizontal, z)),
     )
+
+
+def pan_tilt_deg(
+    target_m: ArrayLike, position_m: ArrayLike, yaw_deg: float = 0.0, pitch_deg: float = 0.0, roll_deg: float = 0.0
+) -> tuple[float, float, float]:
+    """Pan and tilt, in degrees, that turn a camera from its rest towards a place, and the distance in metres.
+
+    Pan is the rotation to the right about the camera's own upright axis, -180 to 180; tilt, which follows it, is
+    upwards, -90 to 90. At rest the camera looks along its +x axis, with +z up.
+
+    Parameters
+    ----------
+    target_m, position_m : (3,)
+        The place and the camera's, metres.
+    yaw_deg, pitch_deg, roll_deg : float
+        How the camera is mounted: see `posed`.
+    """
+    away_m = np.asarray(target_m, dtype=np.float64) - np.asarray(position_m, dtype=np.float64)
+    seen_m = np.asarray(away_m @ rotation(yaw_deg, pitch_deg, roll_deg))
+    azimuth_deg, elevation_deg, distance_m = direction_deg(np.zeros(3), seen_m)
+    return -azimuth_deg, elevation_deg, distance_m
 
 
 @dataclass(frozen=True, slots=True)

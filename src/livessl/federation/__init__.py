@@ -1,4 +1,5 @@
 """The hub: one API, history and page for many sites, whose servers send their results through NATS JetStream.
 
-`livessl.server.forwarding` is the sites' side.
+`intake` reads what sites send, `archive` stores it, and `routes` answers. `livessl.server.forwarding` is the sites'
+side; nothing here locates anything.
 """

@@ -25,12 +25,17 @@ from livessl.server.api.hosts import HostCheck, ServerNames
 from livessl.server.api.proxy import BehindProxy
 from livessl.server.api.queries import refuse_unknown_parameters
 from livessl.server.event_retention import delete_old_events
+from livessl.server.forwarding.stream import ended
 from livessl.server.history.database import StoreError
 from livessl.server.http import certificate_of, listen, url_of, uvicorn_server
 from livessl.server.refusals import Refusals
+from livessl.service_manager import ServiceManager
 
 PAGE: Final = Path(__file__).parent / "page"
 """Files of the page."""
+
+SIGN_S: Final = 0.2
+"""Interval, in seconds, at which the event loop gives a sign of life."""
 
 _CSP: Final = "default-src 'self'; img-src 'self' data:; frame-ancestors 'self'"
 
@@ -89,6 +94,8 @@ class HubServer:
     ----------
     hub : Hub
     clock : Clock
+    service : ServiceManager or None
+        Gets reports; None for nobody.
 
     Raises
     ------
@@ -100,11 +107,12 @@ class HubServer:
         If an SQLite file cannot be used; PostgreSQL may come later.
     """
 
-    def __init__(self, hub: Hub, clock: Clock) -> None:
+    def __init__(self, hub: Hub, clock: Clock, service: ServiceManager | None = None) -> None:
         http = hub.settings.http
         access = Access(None if http.tokens is None else hub.file(http.tokens))
         certificate = certificate_of(http, hub.file, "http")
         self._access, self._clock, self._hub = access, clock, hub
+        self._service = ServiceManager(clock) if service is None else service
         with ExitStack() as undo:  # closes what is open if a later step fails
             self._listener = listen(http.host, http.port)
             undo.callback(self._listener.close)
@@ -112,7 +120,7 @@ class HubServer:
             """The database, which other hubs may share."""
             undo.callback(self.archive.close)
             self.intake = Intake(hub, self.archive, clock)
-            """What takes messages in."""
+            """The part that takes messages in."""
             undo.pop_all()
         app = create_hub_app(hub, self.archive, self.intake, access, Refusals(clock))
         self.uvicorn = uvicorn_server(app, certificate)
@@ -136,13 +144,26 @@ class HubServer:
         receiving = asyncio.create_task(self.intake.run())
         receiving.add_done_callback(lambda _: self.stop())
         retention = delete_old_events(self.archive, self._clock, self._hub.settings.retention_days)
-        tasks = [receiving, *(asyncio.create_task(work) for work in (retention, self._access.reload_tokens()))]
+        others = retention, self._access.reload_tokens(), self._give_signs_of_life()
+        tasks = [receiving, *(asyncio.create_task(work) for work in others)]
         try:
             await self.uvicorn.serve(sockets=[self._listener])
         finally:
+            self._service.stopping()
             failure = receiving.exception() if receiving.done() and not receiving.cancelled() else None
-            for task in tasks:
-                task.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)
+            await ended(*tasks)
         if failure is not None:
             raise failure
+
+    async def _give_signs_of_life(self) -> None:
+        """Report to the service manager, while the event loop turns."""
+        while True:
+            if self.uvicorn.started:
+                self._service.turn(self._in_words)
+            await asyncio.sleep(SIGN_S)
+
+    def _in_words(self) -> str:
+        if self.intake.problem is not None:
+            return f"{self.intake.problem}; serving on {self.url}"
+        work = "takes the messages of the sites in" if self.intake.has_turn else "another hub takes messages in"
+        return f"{work}; serving on {self.url}"

@@ -1,4 +1,4 @@
-"""What a hub keeps of its sites, in one database that several hubs may share: each message is taken in once, in order.
+"""Data that a hub keeps of its sites, in a database that hubs may share. Each message is taken in once, and in order.
 
 The number of the last message that was taken in from each outbox is in the database, and is raised in the transaction
 that stores the message. So it does not matter how often a message comes, and to which hub.
@@ -47,6 +47,8 @@ _HEARD: Final = (
     )
 )
 
+_REPORTED: Final = update(sites).where(sites.c.site == bindparam("of_site")).values(report=bindparam("body"))
+
 _log = logging.getLogger(__name__)
 
 
@@ -70,7 +72,7 @@ class Archive:
         self._gaps = Gaps()
 
     def expire(self, before_ns: int, end: threading.Event | None = None) -> int:
-        """Delete events and alerts of before a time; return the number of events."""
+        """Delete events and alerts from before a time; return the number of events."""
         gone = self.store.expire(before_ns, end)
         with self._database.writing("delete old alerts") as connection:
             connection.execute(delete(alerts).where(alerts.c.time_ns < max(before_ns, 0)))
@@ -104,7 +106,7 @@ class Archive:
                 return self._skip(deliveries[0], str(error))
         except StoreError:
             raise
-        except Exception as error:  # noqa: BLE001 - whatever a message does to the code, it holds up no other
+        except Exception as error:  # noqa: BLE001 - no message may hold up the others
             if len(deliveries) == 1:
                 _log.debug("a message that cannot be taken in", exc_info=True)
                 return self._skip(deliveries[0], f"{type(error).__name__}: {error}")
@@ -164,12 +166,23 @@ class Archive:
             _log.debug("a message whose place cannot be stored", exc_info=True)
         return Taken([], [], [delivery])
 
-    def note_report(self, site: str, report: JsonObject) -> None:
-        """Keep a site's newest report on itself."""
-        with self._database.writing(f"store the report of site {site!r}") as connection:
-            self._touch(connection, {site}, {}, {})
-            body = orjson.dumps(report).decode()
-            connection.execute(update(sites).where(sites.c.site == site).values(report=body))
+    def note_reports(self, reports: Mapping[str, JsonObject]) -> None:
+        """Keep the newest reports of sites on themselves; one that is refused holds up no other."""
+        if not reports:
+            return
+        try:
+            with self._database.writing(f"store the reports of {', '.join(sorted(reports)[:3])}") as connection:
+                self._touch(connection, set(reports), {}, {})
+                bodies = [{"of_site": site, "body": orjson.dumps(reports[site]).decode()} for site in sorted(reports)]
+                connection.execute(_REPORTED, bodies)
+        except Exception as error:  # whatever a report does to the code, it holds up no other
+            if isinstance(error, StoreError) and not isinstance(error, RejectedError):
+                raise
+            if len(reports) == 1:
+                _log.error("a report is left out: %s", error)
+                return
+            for site, report in reports.items():
+                self.note_reports({site: report})
 
     def _touch(
         self, connection: Connection, names: set[str], missing: Mapping[str, int], newest: Mapping[str, int]

@@ -25,7 +25,7 @@ def _place(name: str) -> str:
 
 
 class StreamConfig(Model):
-    """What NATS keeps of the sites' messages: on how many of its servers, how long, and how much."""
+    """Limits of the stream in NATS: on how many servers it keeps messages, how long, and how much."""
 
     replicas: Annotated[int, Field(ge=1, le=5)] = 1
     max_age_days: Positive = 30.0

@@ -1,4 +1,4 @@
-"""How long the next message of an outbox has been missing, by the time in which it could have been stored."""
+"""Measures how long the next message of an outbox has been missing, counting only time in which it could be stored."""
 
 from __future__ import annotations
 

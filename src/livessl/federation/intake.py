@@ -65,6 +65,9 @@ DUPLICATES_S: Final = 600.0
 LOOK_S: Final = 1.0
 """Interval, in seconds, at which a hub that waits for its turn looks whether another one takes messages in."""
 
+REPORTS_S: Final = 1.0
+"""Interval, in seconds, at which reports of sites are stored."""
+
 TURN_S: Final = 0.25
 """Interval, in seconds, at which a hub that waits for its turn tries to get it."""
 
@@ -110,6 +113,7 @@ class Intake:
         self._archive = archive
         self._clock = clock
         self._standstill, self._looked_ns = Standstill(), 0
+        self._reports: dict[str, JsonObject] = {}
         self._problem: str | None = "not connected yet"
         self.has_turn = False
         """True while this hub is the one that takes messages in."""
@@ -120,11 +124,14 @@ class Intake:
 
     @property
     def problem(self) -> str | None:
-        """Why no messages can be taken in; None if they can."""
+        """Reason why no messages can be taken in; None if they can."""
         return None if self._problem is None else f"{PLACE}: {self._problem}"
 
     async def run(self) -> None:
         """Receive until cancelled, and connect again whenever that is needed."""
+        await asyncio.gather(self._stay_connected(), self._store_reports())
+
+    async def _stay_connected(self) -> None:
         while True:
             try:
                 await self._receive()
@@ -274,16 +281,29 @@ class Intake:
         self.rejected += len(taken.rejected)
 
     async def _take_report(self, message: Msg) -> None:
-        """Keep a site's report on itself; one that cannot be kept is followed by the next."""
+        """Take a site's report on itself, to be stored soon; only the newest of a site counts."""
         site = parse_subject(message.subject)
         try:
             report: JsonObject = Report.model_validate_json(message.data).model_dump(mode="json")
-            if site is not None:
-                await asyncio.to_thread(self._archive.note_report, site[0], report)
         except ValidationError as error:
             _log.error("%s: a report is left out: %s", message.subject, " ".join(str(error).split()))
-        except StoreError as error:
-            _log.error("%s", error)
+            return
+        if site is not None:
+            self._reports[site[0]] = report
+
+    async def _store_reports(self) -> None:
+        """Store the reports that have come, all of a second at once, until cancelled.
+
+        Each by itself would be a transaction of its own: two hundred a second with a thousand sites. Those that cannot
+        be stored are followed by the next ones.
+        """
+        while True:
+            await asyncio.sleep(REPORTS_S)
+            reports, self._reports = self._reports, {}
+            try:
+                await asyncio.to_thread(self._archive.note_reports, reports)
+            except StoreError as error:
+                _log.error("%s", error)
 
     def _note(self, problem: str | None) -> None:
         """Remember why no messages come in, and log it if that is news."""

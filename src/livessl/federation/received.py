@@ -1,4 +1,4 @@
-"""What a hub needs of a message to store it: no more, so that sites of other releases are understood."""
+"""The fields that a hub needs to store a message, and no more, so that sites of other releases are understood."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether any hub takes messages in, by what the stream's consumer says of itself."""
+"""Decides whether any hub takes messages in, by the state of the stream's consumer."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a hub stores of each message, by its kind."""
+"""The parts of each message that a hub stores, by its kind."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Delivery(NamedTuple):
 
 
 class Taken(NamedTuple):
-    """What became of some deliveries: which are done with, which wait for earlier ones, and which are of no use."""
+    """Outcome of some deliveries: those that are done with, those that wait for earlier ones, and those of no use."""
 
     done: list[Delivery]
     early: list[Delivery]

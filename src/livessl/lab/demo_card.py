@@ -96,7 +96,7 @@ def running(
 
 
 def _play_from(interface: Interface, scene: Scene, start_ns: int, clock: Clock) -> None:
-    """Have the scene begin at a time to come; its end, which is silent or is left out, is played before."""
+    """Make the scene begin at a future time; until then its end is played, which is silent or left out."""
     rounds = -(-LEAD_NS // round(1e9 * scene.duration_s))
     before_ns = round(rounds * 1e9 * scene.duration_s / (1.0 + 1e-6 * PPM))
     interface.begin(clock.monotonic_ns() + start_ns - clock.now_ns() - before_ns)

@@ -51,6 +51,14 @@ class AlertedFinding(Model):
     input: int | None = Field(ge=1, description="Input of the device that carries the channel, if known.", examples=[7])
 
 
+class OpenLinks(Model):
+    """Links that open what an alert shows without a token, for whoever has them, until they expire."""
+
+    picture: str | None = Field(description="Link to the picture; null if there is none, or the site gives none.")
+    clip: str | None = Field(description="Link to the recording, once it is cut; null if the site gives none.")
+    until_utc: UtcTime = Field(description="When the links expire.")
+
+
 class Alert(Model):
     """An alert of a rule about an event, a change of a track, an array or a finding; the others are null."""
 
@@ -79,6 +87,9 @@ class Alert(Model):
         default=None,
         description="Address of the list of the event's recordings; null if the site keeps none.",
         examples=["http://127.0.0.1:8000/api/v1/events/lab-1/clips"],
+    )
+    links: OpenLinks | None = Field(
+        default=None, description="Only where an action delivers the alert: links for people without a token."
     )
     zones: list[str] = Field(description="Zones of the rule that it came from.", examples=[["door"]])
     membership: list[Membership] = Field(description="The same zones with their probabilities.")

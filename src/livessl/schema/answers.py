@@ -226,7 +226,7 @@ class HeatMap(Versioned):
 
 
 class Secured(Model):
-    """Which connections are protected."""
+    """Connections that are protected."""
 
     nodes: bool = Field(description="Whether nodes need an enrolled key and are encrypted.", examples=[True])
     tokens: bool = Field(description="Whether clients need a token.", examples=[True])
@@ -250,12 +250,13 @@ class LoadState(StrEnum):
 class Shed(StrEnum):
     """Work that is given up under overload, in this order.
 
-    `updates`: only some windows of a sound that goes on are located. `maps`: no power maps are drawn. `arrays`: sounds
-    are located from the few arrays to which they are clearest. `quiet`: frames of quiet are correlated only if sound
-    follows.
+    `updates`: only some windows of a sound that goes on are located. `second_looks`: a sound whose first answer is
+    doubtful is not located again by other evidence. `maps`: no power maps are drawn. `arrays`: sounds are located from
+    the few arrays to which they are clearest. `quiet`: frames of quiet are correlated only if sound follows.
     """
 
     UPDATES = "updates"
+    SECOND_LOOKS = "second_looks"
     MAPS = "maps"
     ARRAYS = "arrays"
     QUIET = "quiet"

@@ -106,7 +106,7 @@ class AlertMessage(_Numbered, Alert):
 
 
 class ZoneMessage(_Numbered, ZoneChange):
-    """What a track does in a zone: it enters, leaves, or loiters."""
+    """A track enters a zone, leaves it, or loiters in it."""
 
 
 class ZonesMessage(_Numbered):
@@ -117,7 +117,7 @@ class ZonesMessage(_Numbered):
 
 
 class PosesMessage(_Numbered):
-    """Where the arrays are, after other poses have come into force."""
+    """Poses of the arrays, after other poses have come into force."""
 
     kind: Literal["poses"]
     arrays: dict[str, ArrayGeometry] = Field(description="All arrays by name.")

@@ -13,7 +13,7 @@ Dbfs = Annotated[float, Field(description="Level over the whole band in dB relat
 
 
 class DriftState(StrEnum):
-    """How well the drift of a device's clock is known.
+    """Knowledge of the drift of a device's clock.
 
     `settling`: its error may be above 5 ppm. `known`: it is below. `unmeasurable`: the device is read through a sound
     server, whose times do not show the device's clock.

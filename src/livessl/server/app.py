@@ -13,8 +13,10 @@ from typing import Final
 from livessl.clock import Clock
 from livessl.errors import ConfigError
 from livessl.garbage import collect_as_usual
+from livessl.server.alerts.evidence import Evidence
+from livessl.server.alerts.in_force import Surroundings
 from livessl.server.alerts.outbox import OutboxError
-from livessl.server.alerts.service import Alerts
+from livessl.server.alerts.service import Alerts, Conditions
 from livessl.server.api.app import create_app
 from livessl.server.api.auth import Access
 from livessl.server.api.encode import JsonObject
@@ -34,6 +36,7 @@ from livessl.server.latency import Latency
 from livessl.server.maps import Maps
 from livessl.server.overload import Overload
 from livessl.server.parts import Parts
+from livessl.server.pose_refiner import PoseRefiner
 from livessl.server.proposals import Proposals
 from livessl.server.publisher import Publisher
 from livessl.server.receiver import Inbox, Receiver
@@ -41,6 +44,8 @@ from livessl.server.recent_log import RecentLog
 from livessl.server.reload import Reloader
 from livessl.server.set_up_in_force import SetUpInForce
 from livessl.server.set_up_watch import SetUpWatch
+from livessl.server.sign_of_life import SignOfLife
+from livessl.server.signed_links import SignedLinks
 from livessl.server.sinks import Sinks
 from livessl.server.site_time import SiteTime
 from livessl.server.store import Store
@@ -49,6 +54,8 @@ from livessl.server.trails import Trails
 from livessl.server.zones.book import ZoneBook
 from livessl.server.zones.presence import Presence
 from livessl.server.zones.shapes import ZoneMap
+from livessl.service_manager import ServiceManager
+from livessl.site.alert_checks import link_secret_file
 from livessl.site.checks import unprotected_addresses
 from livessl.site.floor_plan import read_floor_plan
 from livessl.site.models import Site
@@ -83,6 +90,7 @@ def assemble(
     on_event: Callable[[JsonObject], None] | None = None,
     url: str = "",
     read_site: Callable[[], Site] | None = None,
+    links: SignedLinks | None = None,
 ) -> Parts:
     """Make everything that runs in a server; nothing runs yet.
 
@@ -98,6 +106,8 @@ def assemble(
         Address of the server, for the links in alerts.
     read_site : callable or None
         Reads the site file again; None for a server without one.
+    links : SignedLinks or None
+        Signs links for people without a token; None if nobody needs one.
 
     Raises
     ------
@@ -148,10 +158,9 @@ def assemble(
         set_up = SetUpInForce(site, clock, publish)
         kept, listeners = site.server.clips, Listeners()
         clips = None if kept is None else Clips(site, kept, clock, site_time, overload)
-        alerts = Alerts(
-            site, clock, store, array_states, set_up_watch, site_time, publish_alert, url, zones, clips, traces,
-            lambda: set_up.site,
-        )  # fmt: skip
+        evidence = Evidence(lambda: set_up.site, zones, clips)
+        around = Surroundings(clock, store, zones, url, evidence, traces, links)
+        alerts = Alerts(site, around, Conditions(array_states, set_up_watch, site_time), publish_alert)
         undo.callback(alerts.stop)
 
         def publish_change(change: JsonObject, time_ns: int) -> None:
@@ -169,7 +178,8 @@ def assemble(
         engine = Engine(
             site, clock, receiver, site_time, array_states, event_log, maps, publisher, overload, zones, sound, traces
         )
-        proposals = Proposals(set_up, set_up_watch.heard, clock, overload)
+        proposals = Proposals(set_up, set_up_watch.heard, clock)
+        refiner = PoseRefiner(proposals, set_up, set_up_watch.heard, overload)
         for follower in (engine.prepare, set_up_watch.prepare, *(() if clips is None else (clips.prepare,))):
             set_up.follow(follower)
         floor_plan = read_floor_plan(site)
@@ -193,6 +203,7 @@ def assemble(
         overload=overload,
         set_up=set_up,
         proposals=proposals,
+        refiner=refiner,
         set_up_watch=set_up_watch,
         store=store,
         sinks=sinks,
@@ -224,6 +235,8 @@ class Server:
         If true, the caller steps the fusion by `parts.engine.turn()`; else it runs in a thread of its own.
     read_site : callable or None
         Reads the site file again, for a reload; it raises `ConfigError` with all faults of the file.
+    service : ServiceManager or None
+        Gets reports; None for nobody.
 
     Raises
     ------
@@ -245,20 +258,19 @@ class Server:
         receiver: Inbox | None = None,
         stepped: bool = False,
         read_site: Callable[[], Site] | None = None,
+        service: ServiceManager | None = None,
     ) -> None:
         site = _usable(site, method)
         read = None if read_site is None else lambda: _usable(read_site(), method)
         http = site.server.http
-        self._access = Access(None if http.tokens is None else site.file(http.tokens))
+        links = None if http.tokens is None else SignedLinks(clock, link_secret_file(site))
+        self._access = Access(None if http.tokens is None else site.file(http.tokens), links)
         certificate = certificate_of(http, site.file)
         self._clock = clock
         self._stepped = stepped
         self._kernel_loader = KernelLoader()
         self.loop: asyncio.AbstractEventLoop | None = None
         """The event loop of HTTP and subscribers, while the server runs."""
-        # milliseconds since the epoch: a restarted server never reuses a number, as it publishes fewer than one message
-        # per millisecond
-        first_seq = clock.now_ns() // 1_000_000
         with ExitStack() as undo:  # closes what is open if a later step fails
             self._listener = listen(http.host, http.port)
             undo.callback(self._listener.close)
@@ -267,8 +279,11 @@ class Server:
             store = Store.of(site)
             undo.callback(store.close)
             url = url_of(self._listener, tls=certificate is not None)
-            fanout = Fanout(first_seq)
-            self.parts = assemble(site, clock, store, sinks, fanout, self._publish, receiver, on_event, url, read)
+            # milliseconds since the epoch: fewer than one message per millisecond is published, so none is used again
+            fanout = Fanout(clock.now_ns() // 1_000_000)
+            self.parts = assemble(
+                site, clock, store, sinks, fanout, self._publish, receiver, on_event, url, read, links
+            )
             undo.pop_all()
         self.uvicorn = uvicorn_server(create_app(self.parts, self._access), certificate)
         """The HTTP server."""
@@ -276,6 +291,8 @@ class Server:
         """The address that nodes connect to."""
         self.url = url
         """The address of API and dashboard."""
+        self._service = service or ServiceManager(clock)
+        self._sign_of_life = SignOfLife(self.parts, self._service, url, lambda: self.uvicorn.started)
 
     def run(self) -> None:
         """Serve until SIGINT, SIGTERM or `stop`; raise the error of a thread that has failed, if one has."""
@@ -302,7 +319,7 @@ class Server:
             # what computes at leisure comes last: what has to be on the disk does not wait for it
             self.parts.maps.stop()
             self.parts.set_up_watch.stop()
-            self.parts.proposals.stop()
+            self.parts.refiner.stop()
         if self.parts.failure is not None:
             raise self.parts.failure
 
@@ -322,13 +339,13 @@ class Server:
         self.parts.receiver.start()
         self.parts.maps.start()
         self.parts.set_up_watch.start()
-        self.parts.proposals.start()
+        self.parts.refiner.start()
         self.parts.alerts.start()
         if self.parts.clips is not None:
             self.parts.clips.start()
         if self.parts.hub_link is not None:
             self.parts.hub_link.start()
-        self.parts.reloader.start()
+        self.parts.reloader.start(self._service.reloading)
         if not self._stepped:
             self.parts.engine.start(self._kernel_loader.load)
         retention = delete_old_events(self.parts.store, self._clock, self.parts.site.store.retention_days)
@@ -336,6 +353,7 @@ class Server:
         try:
             await self.uvicorn.serve(sockets=[self._listener])
         finally:
+            self._service.stopping()
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
@@ -361,6 +379,7 @@ class Server:
     async def _watch(self) -> None:
         """Stop when a thread has failed: a service manager restarts a server that ends, not one that looks alive."""
         while self.parts.failure is None and not self.uvicorn.should_exit:
+            self._sign_of_life.give()
             await asyncio.sleep(WATCH_S)
         self.stop()
         self.parts.fanout.ended.set()

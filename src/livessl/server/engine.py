@@ -98,12 +98,17 @@ class Engine:
         self._parallel = Parallel()
         self._stop = threading.Event()
         self._prepare: Callable[[], None] | None = None
-        self.has_turned = False
-        """Whether the thread has taken its first turn: what computes is loaded by then."""
+        self.turns = 0
+        """Turns that the thread has taken; a count that stands still is a thread that hangs."""
         self._thread = threading.Thread(target=self._work, name="fusion", daemon=True)
         self.failure: BaseException | None = None
         """The error that has ended the thread, if it has ended."""
         self._begin(live_run(site, event_log.begin_live(), self._parallel.for_each))
+
+    @property
+    def has_turned(self) -> bool:
+        """Whether the thread has taken its first turn: what computes is loaded by then."""
+        return self.turns > 0
 
     @property
     def updates_left_out(self) -> int:
@@ -184,7 +189,7 @@ class Engine:
                 self._prepare()
             while not self._stop.is_set():
                 self.turn()
-                self.has_turned = True
+                self.turns += 1
         except BaseException as error:
             self.failure = error
             _log.exception("the fusion thread has failed; the server ends")

@@ -70,7 +70,7 @@ class EventTraces:
         self._traces.child("publish", subject, began_ns, ended_ns, {})
 
     def alerted(self, alert: JsonObject, began_ns: int, ended_ns: int) -> None:
-        """Add the span of the judgement that raised an alert; of conditions there is no event to add it to."""
+        """Add the span of the judgement that raised an alert; an alert about a condition has no event to add it to."""
         if alert["event"] is not None:
             attributes = {"livessl.rule": alert["rule"], "livessl.alert": alert["key"]}
             self._traces.child("alert", event_subject(alert["event"]["id"]), began_ns, ended_ns, attributes)

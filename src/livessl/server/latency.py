@@ -1,7 +1,7 @@
 """Latency from the sound to a client's socket, by stages, in histograms.
 
-It counts from the moment at which all had happened that an answer needs: the end of the window; for an event, the end
-of the quiet that ends it. Whatever lies before is not a delay of this system.
+It counts from the earliest moment at which an answer can be known: the end of the window, or, for an event, the end of
+the quiet that ends it. What lies before is not a delay of this system.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Arrivals:
         self._last[frame_index] = arrival
 
     def stages(self, answer: Update | Event, located_ns: int) -> Stages | None:
-        """Return where the time went of an answer that was there at site time `located_ns`.
+        """Return how long each stage took of an answer that was there at site time `located_ns`.
 
         None if no arrival is known of the last frame index that the answer needs.
         """

@@ -186,7 +186,7 @@ class Maps:
     def newest(self, array: str) -> Drawn | None:
         """Wait for the maps of the newest window and return them, an array's own included if it detected the sound.
 
-        None before the first window. After `PATIENCE_S` without a drawing, the last one there is.
+        Returns None before the first window, and the last drawing after `PATIENCE_S` without a new one.
         """
         with self._changed:
             if self._is_missing({array}, set()):

@@ -20,6 +20,7 @@ MEMORY_NS: Final = 5_000_000_000
 
 _WORDS: Final = {
     "updates": "some updates",
+    "second_looks": "second looks at doubtful sounds",
     "maps": "power maps",
     "arrays": "arrays with the least evidence",
     "quiet": "frames of quiet",
@@ -101,7 +102,7 @@ class Overload:
             self._report(before, level)
         relief = LEVELS[level]
         if level and delay_s > PROMPT_S:
-            relief = replace(relief, update_every=None)
+            relief = replace(relief, update_every=None, second_looks=False)
         self.relief = relief
         return relief
 

@@ -17,6 +17,7 @@ from livessl.server.journal import Journal
 from livessl.server.latency import Latency
 from livessl.server.maps import Maps
 from livessl.server.overload import Overload
+from livessl.server.pose_refiner import PoseRefiner
 from livessl.server.proposals import Proposals
 from livessl.server.receiver import Inbox
 from livessl.server.recent_log import RecentLog
@@ -58,6 +59,7 @@ class Parts:
     overload: Overload
     set_up: SetUpInForce
     proposals: Proposals
+    refiner: PoseRefiner
     set_up_watch: SetUpWatch
     store: Store
     sinks: Sinks
@@ -74,7 +76,7 @@ class Parts:
     def failure(self) -> BaseException | None:
         """The error that has ended one of the threads, if any has ended."""
         parts = (
-            *(self.engine, self.receiver, self.maps, self.set_up_watch, self.proposals),
+            *(self.engine, self.receiver, self.maps, self.set_up_watch, self.refiner),
             *(self.alerts, self.clips, self.store.backlog, self.reloader, self.hub_link),
         )
         failures = (thread.failure for thread in parts if thread is not None)

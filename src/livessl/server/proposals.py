@@ -1,12 +1,11 @@
 """Proposals for the poses of arrays: measured by claps, refined by unknown sounds, or typed. None applies by itself.
 
 A person accepts a proposal (`Proposals.accept`); then it is written into the calibration file and comes into force.
-A thread refines the poses with the sounds that the server locates anyway, and keeps what it proposes for people to see.
+`pose_refiner` makes proposals on its own, and `proposal_checks` decides what keeps one from being accepted.
 """
 
 from __future__ import annotations
 
-import logging
 import threading
 from collections import OrderedDict
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -18,48 +17,24 @@ import numpy as np
 
 from livessl.clock import Clock
 from livessl.core.types import ArraySpec, FloatArray, Observation
-from livessl.errors import ConfigError, RunError
+from livessl.errors import RunError
 from livessl.server.heard_sounds import HeardSound, HeardSounds
-from livessl.server.overload import Overload
+from livessl.server.proposal_checks import ClapFit, contradiction, is_enough, misfit_with_site, refusal_of
 from livessl.server.set_up_in_force import SetUpInForce
-from livessl.site.build.calibrated import measured_arrays, typed_arrays, with_calibration
-from livessl.site.models import CalibratedArray, CalibrationFile, Site
+from livessl.site.build.calibrated import measured_arrays, typed_arrays
+from livessl.site.models import CalibratedArray, Site
 
 if TYPE_CHECKING:
-    from livessl.core.commission.resection import MeasuredPose, MeasuredSetUp
+    from livessl.core.commission.resection import MeasuredSetUp
 
 KEPT: Final = 16
 """Number of proposals of people that can still be accepted, and of those of the thread; the oldest ones are dropped."""
 
-WAIT_S: Final = 2.0
-"""Interval, in seconds, at which the thread looks for new sounds, and at which it can be stopped."""
-
-JOIN_S: Final = 1.0
-"""Longest wait, in seconds, for a refinement that is under way when the server stops; it is of no use any more."""
-
-REFINED_SOUNDS: Final = 20
-"""Fewest sounds from which the thread refines: fewer leave poses unsure."""
-
 MOST_SOUNDS: Final = 40
 """Most sounds, the newest ones, from which poses are refined: older ones may be from before an array was moved."""
 
-NEW_SOUNDS: Final = 10
-"""Number of further sounds after which the thread refines again."""
-
 POSITION_STD_M: Final = 0.1
 """Standard deviation of positions that are refined, metres: as measured by tape."""
-
-SIGNIFICANT: Final = 3.0
-"""Standard deviations by which a pose has to be off before the thread proposes another one."""
-
-LEAST_SHIFT_M: Final = 0.02
-LEAST_TURN_DEG: Final = 0.7
-"""Least shift in metres and turn in degrees that the thread proposes; smaller ones improve no position."""
-
-AGREES_M: Final = 0.3
-"""Distance, in metres, between a clap and its place up to which the two agree with the measured poses."""
-
-_log = logging.getLogger(__name__)
 
 
 class ProposalRefusedError(RunError):
@@ -68,31 +43,6 @@ class ProposalRefusedError(RunError):
 
 class BusyError(RunError):
     """Another measurement is running."""
-
-
-@dataclass(frozen=True, slots=True)
-class ClapFit:
-    """How well a sound at a measured place fits the poses before and after.
-
-    Parameters
-    ----------
-    number : int
-        Number of the sound.
-    place_m : (3,) float64
-        Where it was made, metres.
-    before_m, after_m : float or None
-        Distance from there to where its delays place it, metres; None if two arrays did not receive it.
-    """
-
-    number: int
-    place_m: FloatArray
-    before_m: float | None
-    after_m: float | None
-
-    @property
-    def agrees(self) -> bool | None:
-        """True if it agrees with the proposed poses; None where that cannot be said."""
-        return None if self.after_m is None else self.after_m <= AGREES_M
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,25 +89,6 @@ class Proposal:
     refusal: str | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Refinement:
-    """What the sounds so far say of the poses.
-
-    Parameters
-    ----------
-    sounds : int
-        Number of kept sounds that two arrays received.
-    proposal : Proposal or None
-        The poses that the sounds say, if they differ from those in force by more than their uncertainty.
-    agrees : bool or None
-        Whether the sounds agree with the poses in force; None before there are enough, and where they leave it open.
-    """
-
-    sounds: int = 0
-    proposal: Proposal | None = None
-    agrees: bool | None = None
-
-
 class Proposals:
     """Makes and keeps proposals; every thread may call it.
 
@@ -167,29 +98,17 @@ class Proposals:
     heard : HeardSounds
         The last sounds.
     clock : Clock
-    overload : Overload
-        Nothing is refined while sound arrives faster than it is located.
     """
 
-    def __init__(self, set_up: SetUpInForce, heard: HeardSounds, clock: Clock, overload: Overload) -> None:
+    def __init__(self, set_up: SetUpInForce, heard: HeardSounds, clock: Clock) -> None:
         self._set_up = set_up
         self._heard = heard
         self._clock = clock
-        self._overload = overload
         self._busy = threading.Lock()
         self._lock = threading.Lock()
         self._kept: OrderedDict[str, Proposal] = OrderedDict()
-        self._kept_of_thread: OrderedDict[str, Proposal] = (
-            OrderedDict()
-        )  # they come all the time, and push no other out
+        self._kept_of_thread: OrderedDict[str, Proposal] = OrderedDict()  # new ones come often, and push out no other
         self._made = 0
-        self._refined: tuple[Site, int] | None = None  # the site and the last sound of the last refinement
-        self.refinement = Refinement()
-        """The latest refinement by the thread. Read it once for values that belong together."""
-        self._stop = threading.Event()
-        self._thread: threading.Thread | None = None
-        self.failure: BaseException | None = None
-        """The error that has ended the thread, if one has."""
 
     # --- making proposals
 
@@ -212,7 +131,7 @@ class Proposals:
         with self.measuring():
             measured = measure_set_up(site, observed, places_m, place_std_m)
             stored = measured_arrays(site, measured)
-            refusal = _undetermined(measured) or _misfit_with_site(site, stored)
+            refusal = refusal_of(site, measured, stored)
             before_m = np.linalg.norm(place_sounds(site, observed) - places_m, axis=1)
             moved = _moved(site, measured)
             after_m = np.linalg.norm(place_sounds(moved, observed) - places_m, axis=1)
@@ -221,13 +140,13 @@ class Proposals:
             ClapFit(number, place_m, _or_none(before), _or_none(after))
             for number, place_m, before, after in zip(numbers, places_m, before_m, after_m, strict=True)
         )
-        if refusal is None and sum(clap.agrees is not False for clap in claps) < _least_agreeing(len(claps)):
-            off = ", ".join(str(index) for index, clap in enumerate(claps, 1) if clap.agrees is False)
-            refusal = f"claps {off} contradict the others by more than {AGREES_M:g} m; measure their places again"
-        return self._keep(
-            "poses", site, measured, stored, claps=claps, next_place_m=next_m, refusal=refusal,
-            is_enough=_is_enough(site, measured),
+        made_ns = self._clock.now_ns()
+        proposal = Proposal(
+            self._new_id("poses", made_ns), "poses", made_ns, site, _microphones(measured), stored, measured,
+            claps=claps, next_place_m=next_m, is_enough=is_enough(site, measured),
+            refusal=contradiction(claps) if refusal is None else refusal,
         )  # fmt: skip
+        return self._keep(proposal)
 
     def by_sounds(self, known: Collection[str], position_std_m: float = POSITION_STD_M) -> Proposal:
         """Refine the poses of all arrays but the known ones by the last sounds, wherever these were.
@@ -239,9 +158,34 @@ class Proposals:
         BusyError
             If another measurement is running.
         """
-        site, sounds = self._set_up.site, _shared(self._heard.after(0))[-MOST_SOUNDS:]
         with self.measuring():
-            return self._refine(site, sounds, known, position_std_m)
+            return self.refine(self._set_up.site, shared_sounds(self._heard.after(0)), known, position_std_m)
+
+    def refine(
+        self,
+        site: Site,
+        sounds: Sequence[HeardSound],
+        known: Collection[str],
+        position_std_m: float = POSITION_STD_M,
+        *,
+        is_of_thread: bool = False,
+    ) -> Proposal:
+        """Refine the poses of all arrays but the known ones by some sounds.
+
+        Raises
+        ------
+        ValueError
+            If there are too few sounds, or no array to refine.
+        """
+        from livessl.site.build.set_up import refine_set_up
+
+        measured = refine_set_up(site, [sound.observations for sound in sounds], known, position_std_m)
+        stored, made_ns = measured_arrays(site, measured), self._clock.now_ns()
+        proposal = Proposal(
+            self._new_id("refine", made_ns), "refine", made_ns, site, _microphones(measured), stored, measured,
+            known=tuple(known), refusal=refusal_of(site, measured, stored),
+        )  # fmt: skip
+        return self._keep(proposal, is_of_thread=is_of_thread)
 
     def typed(self, poses: Mapping[str, tuple[FloatArray, FloatArray]]) -> Proposal:
         """Propose poses that somebody typed or dragged.
@@ -260,8 +204,12 @@ class Proposals:
             at_m = site.array(name).microphones_m
             arms_m = Rotation.from_euler("xyz", turn_deg, degrees=True).apply(at_m - at_m.mean(axis=0))
             microphones[name] = np.asarray(arms_m + position_m)
-        stored = typed_arrays(site, microphones)
-        return self._keep("typed", site, None, stored, microphones=microphones, refusal=_misfit_with_site(site, stored))
+        stored, made_ns = typed_arrays(site, microphones), self._clock.now_ns()
+        proposal = Proposal(
+            self._new_id("typed", made_ns), "typed", made_ns, site, microphones, stored,
+            refusal=misfit_with_site(site, stored),
+        )  # fmt: skip
+        return self._keep(proposal)
 
     @contextmanager
     def measuring(self) -> Iterator[None]:
@@ -303,96 +251,13 @@ class Proposals:
         sounds, c_m_s = (0, 0.0) if measured is None else (measured.sounds, measured.c_m_s)
         return self._set_up.accept(proposal.stored, proposal.method, sounds, c_m_s, proposal.site)
 
-    # --- the thread that refines
-
-    def start(self) -> None:
-        """Begin to refine."""
-        self._thread = threading.Thread(target=self._work, name="refine", daemon=True)
-        self._thread.start()
-
-    def stop(self) -> None:
-        """Stop, and wait a little for the thread."""
-        self._stop.set()
-        if self._thread is not None:
-            self._thread.join(timeout=JOIN_S)
-
-    def refine_if_new(self) -> None:
-        """Refine if there are enough new sounds or other poses; the thread calls it, and a test may."""
-        site, kept = self._set_up.site, self._heard.after(0)
-        sounds = _shared(kept)[-MOST_SOUNDS:]
-        if len(sounds) < REFINED_SOUNDS or len(site.processed) < 2:
-            self.refinement = Refinement(len(sounds))
-            return
-        before = self._refined
-        new = len(sounds) if before is None else sum(sound.number > before[1] for sound in sounds)
-        if before is not None and before[0] is site and new < NEW_SOUNDS:
-            return
-        try:
-            proposal = self._refine(site, sounds, [_best_known(site)], POSITION_STD_M, is_of_thread=True)
-        except (ValueError, np.linalg.LinAlgError) as error:
-            _log.debug("the sounds so far do not refine the poses: %s", error)
-            self._refined, self.refinement = (site, sounds[-1].number), Refinement(len(sounds))
-            return
-        self._refined = site, sounds[-1].number
-        if proposal.refusal is not None:
-            self.refinement = Refinement(len(sounds))
-        elif _is_significant(proposal):
-            self.refinement = Refinement(len(sounds), proposal, agrees=False)
-        else:
-            self.refinement = Refinement(len(sounds), None, agrees=True)
-
-    def _work(self) -> None:
-        try:
-            while not self._stop.wait(WAIT_S):
-                if self._overload.message is None:
-                    self.refine_if_new()
-        except BaseException as error:
-            self.failure = error
-            _log.exception("the refinement of the poses has failed; the server ends")
-            raise
-
-    def _refine(
-        self,
-        site: Site,
-        sounds: Sequence[HeardSound],
-        known: Collection[str],
-        position_std_m: float,
-        *,
-        is_of_thread: bool = False,
-    ) -> Proposal:
-        from livessl.site.build.set_up import refine_set_up
-
-        measured = refine_set_up(site, [sound.observations for sound in sounds], known, position_std_m)
-        stored = measured_arrays(site, measured)
-        refusal = _undetermined(measured) or _misfit_with_site(site, stored)
-        return self._keep(
-            "refine", site, measured, stored, known=tuple(known), refusal=refusal, is_of_thread=is_of_thread
-        )
-
-    def _keep(
-        self,
-        method: str,
-        site: Site,
-        measured: MeasuredSetUp | None,
-        stored: Mapping[str, CalibratedArray],
-        *,
-        microphones: Mapping[str, FloatArray] | None = None,
-        known: tuple[str, ...] = (),
-        claps: tuple[ClapFit, ...] = (),
-        next_place_m: FloatArray | None = None,
-        is_enough: bool = False,
-        refusal: str | None = None,
-        is_of_thread: bool = False,
-    ) -> Proposal:
-        if microphones is None:
-            microphones = {} if measured is None else {n: pose.microphones_m for n, pose in measured.poses.items()}
-        now_ns = self._clock.now_ns()
+    def _new_id(self, method: str, made_ns: int) -> str:
         with self._lock:
             self._made += 1
-            proposal = Proposal(
-                f"{method}-{now_ns // 1_000_000}-{self._made}",
-                method, now_ns, site, microphones, stored, measured, known, claps, next_place_m, is_enough, refusal,
-            )  # fmt: skip
+            return f"{method}-{made_ns // 1_000_000}-{self._made}"
+
+    def _keep(self, proposal: Proposal, *, is_of_thread: bool = False) -> Proposal:
+        with self._lock:
             kept = self._kept_of_thread if is_of_thread else self._kept
             kept[proposal.id] = proposal
             while len(kept) > KEPT:
@@ -400,19 +265,20 @@ class Proposals:
         return proposal
 
 
-def _shared(sounds: Sequence[HeardSound]) -> list[HeardSound]:
-    """Return the sounds that two arrays or more received clearly."""
+def shared_sounds(sounds: Sequence[HeardSound]) -> list[HeardSound]:
+    """Return the sounds that two arrays or more received clearly; at most the newest `MOST_SOUNDS`."""
     from livessl.core.commission.findings import LEAST_SHARPNESS
 
     def is_clear(one: Observation) -> bool:
         return one.sharpness >= LEAST_SHARPNESS and int(np.isfinite(one.delays_s).sum()) > 1
 
-    return [sound for sound in sounds if sum(map(is_clear, sound.observations)) > 1]
+    shared = [sound for sound in sounds if sum(map(is_clear, sound.observations)) > 1]
+    return shared[-MOST_SOUNDS:]
 
 
-def _best_known(site: Site) -> str:
-    """Return the array whose position is known best; of equals, the first."""
-    return min(site.processed, key=lambda spec: spec.uncertainty.position_m).name
+def _microphones(measured: MeasuredSetUp) -> dict[str, FloatArray]:
+    """Return where the microphones of the measured arrays are, metres."""
+    return {name: pose.microphones_m for name, pose in measured.poses.items()}
 
 
 def _moved(site: Site, measured: MeasuredSetUp) -> Site:
@@ -420,64 +286,12 @@ def _moved(site: Site, measured: MeasuredSetUp) -> Site:
 
     Its speed of sound is that of the site, because the measured one does not come into force.
     """
-    at_m = {name: pose.microphones_m for name, pose in measured.poses.items()}
+    at_m = _microphones(measured)
     processed = tuple(
         ArraySpec(spec.name, at_m.get(spec.name, spec.microphones_m), spec.band_hz, spec.uncertainty, spec.parts)
         for spec in site.processed
     )
     return site.model_copy(update={"processed": processed})
-
-
-def _undetermined(measured: MeasuredSetUp) -> str | None:
-    """Return in words which poses are not determined; None if all are."""
-    from livessl.core.commission.resection import MOST_STD_DEG, MOST_STD_M
-
-    doubtful = [
-        f"{name!r} is known to {pose.position_std_m:.2f} m and {pose.orientation_std_deg:.1f} degrees"
-        for name, pose in measured.poses.items()
-        if not pose.is_determined
-    ]
-    return (
-        f"{', '.join(doubtful)}; at most {MOST_STD_M:g} m and {MOST_STD_DEG:g} degrees are accepted"
-        if doubtful
-        else None
-    )
-
-
-def _misfit_with_site(site: Site, stored: Mapping[str, CalibratedArray]) -> str | None:
-    """Return in words why a site with these arrays could not be loaded; None if it could."""
-    try:
-        with_calibration(site, CalibrationFile(arrays=dict(stored)))
-    except ConfigError as error:
-        return "; ".join(fault.what for fault in error.faults)
-    return None
-
-
-def _is_enough(site: Site, measured: MeasuredSetUp) -> bool:
-    """Return whether the poses of all arrays are known as well as is useful."""
-    from livessl.core.commission.next_place import AIM_DEG, AIM_M
-
-    return len(measured.poses) == len(site.processed) and all(
-        pose.position_std_m <= AIM_M and pose.orientation_std_deg <= AIM_DEG for pose in measured.poses.values()
-    )
-
-
-def _is_significant(proposal: Proposal) -> bool:
-    """Return whether a proposal moves an array by more than its uncertainty, and by so much that it matters."""
-    assert proposal.measured is not None
-    return any(map(_is_off, proposal.measured.poses.values()))
-
-
-def _is_off(pose: MeasuredPose) -> bool:
-    shift_m, turn_deg = float(np.linalg.norm(pose.shift_m)), float(np.degrees(pose.turn.magnitude()))
-    return shift_m > max(LEAST_SHIFT_M, SIGNIFICANT * pose.position_std_m) or turn_deg > max(
-        LEAST_TURN_DEG, SIGNIFICANT * pose.orientation_std_deg
-    )
-
-
-def _least_agreeing(count: int) -> int:
-    """Return how many of some claps have to agree: all but one in four, and four at least."""
-    return max(4, count - count // 4)
 
 
 def _or_none(distance_m: float) -> float | None:

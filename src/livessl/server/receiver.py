@@ -93,7 +93,7 @@ class Inbox(Protocol):
 
     @property
     def arrivals(self) -> Arrivals:
-        """When messages were sent and received."""
+        """Times at which messages were sent and received."""
         ...
 
     @property

@@ -9,7 +9,7 @@ import logging
 import queue
 import threading
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Any, Final, Protocol
 
@@ -124,6 +124,7 @@ class Reloader:
         self._lock = threading.Lock()
         self._requests: queue.SimpleQueue[bool] = queue.SimpleQueue()  # its `put` may interrupt itself
         self._thread: threading.Thread | None = None
+        self._announced: Callable[[], AbstractContextManager[None]] = nullcontext
         self.is_usable = True
         """False if the site file could not be taken over when it was last read."""
         self.needs_restart: Sequence[str] = ()
@@ -147,7 +148,7 @@ class Reloader:
         """
         if self._read is None:
             raise NoSiteFileError("this server was not started from a site file; restart it to change its settings")
-        with self._lock:
+        with self._lock, self._announced():
             self.is_usable = False
             result = self._take_over(self._read())
             self.is_usable, self.needs_restart = True, result.needs_restart
@@ -156,8 +157,15 @@ class Reloader:
         _log.info("the site file was read again: %s", result)
         return result
 
-    def start(self) -> None:
-        """Begin to handle requests, those included that came before."""
+    def start(self, announced: Callable[[], AbstractContextManager[None]] = nullcontext) -> None:
+        """Begin to handle requests, those included that came before.
+
+        Parameters
+        ----------
+        announced : callable
+            Returns a context for the time of each reload, by which others learn of it.
+        """
+        self._announced = announced
         self._thread = threading.Thread(target=self._work, name="reload", daemon=True)
         self._thread.start()
 

@@ -40,7 +40,7 @@ Follower = Callable[[Site], Commit]
 
 _KEYS: Final = ("arrays", "uncertainty", "calibration", "temperature_c", "speed_of_sound_m_s", "c_m_s")
 _TAKEN: Final = (*_KEYS, "specs", "processed")
-"""What is taken over of a site that was loaded anew: keys of its file and the speed of sound, and what they make."""
+"""Fields that are taken over from a site that was loaded anew: keys of its file, the speed of sound, and the arrays."""
 
 
 class SetUpChangedError(RunError):
@@ -102,7 +102,7 @@ class SetUpInForce:
         Returns
         -------
         list of str
-            Names of the arrays that are elsewhere, or are known to be so differently well.
+            Names of the arrays whose pose, or the uncertainty of it, has changed.
 
         Raises
         ------
@@ -139,7 +139,7 @@ class SetUpInForce:
         return prepared.changed
 
     def _changed(self, site: Site) -> list[str]:
-        """Return the names of the arrays that a site with the same arrays has elsewhere, or knows differently well."""
+        """Return the names of the arrays whose pose, or the uncertainty of it, is another in this site."""
         before = {spec.name: spec for spec in self.site.processed}
         return [spec.name for spec in site.processed if _differs(before[spec.name], spec)]
 

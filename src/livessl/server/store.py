@@ -131,7 +131,7 @@ class Store:
 
     @property
     def problem(self) -> str | None:
-        """Why a database cannot be used that has not been usable since the start, as PostgreSQL can be; else None."""
+        """Reason why the database has been unusable since the start, as PostgreSQL may be; None otherwise."""
         return self._database.problem
 
     @property

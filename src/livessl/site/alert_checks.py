@@ -16,6 +16,9 @@ from livessl.site.place import Finding, Place
 OUTBOX: Final = "alerts.sqlite"
 """Name of the outbox where the site file does not give one; it lies beside `server.events_db`."""
 
+LINK_SECRET: Final = "links.secret"  # noqa: S105 - the name of a file
+"""Name of the file, beside the outbox, with the secret that signs links."""
+
 _NAME: Final = re.compile(r"[A-Za-z0-9._-]{1,64}")
 
 
@@ -25,6 +28,12 @@ def outbox_file(site: Site) -> Path | None:
         return site.file(site.alerts.outbox)
     place = history_place(site)
     return place.with_name(OUTBOX) if isinstance(place, Path) else None
+
+
+def link_secret_file(site: Site) -> Path | None:
+    """Return the file of the secret that signs links; None keeps it in memory, as long as the alerts are kept."""
+    outbox = outbox_file(site)
+    return None if outbox is None else outbox.with_name(LINK_SECRET)
 
 
 def alert_faults(site: Site) -> Iterator[Finding]:
@@ -84,6 +93,8 @@ def alert_warnings(site: Site) -> Iterator[str]:
             f"alerts.url: links in alerts name {site.server.http.host}, which no browser can open; set it to the "
             "address under which people reach this server"
         )
+    if "clip" in site.alerts.links.of and site.server.clips is None:
+        yield "alerts.links.of: this site keeps no clips, so that no alert has a link to one; set server.clips"
     used = {action for rule in site.alerts.rules.values() for action in rule.actions}
     for name in site.alerts.actions:
         if name not in used:

@@ -21,6 +21,12 @@ Seconds = Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)]
 """A span of time that may be zero, in seconds."""
 
 
+LIFETIME_S: Final = 86_400.0
+"""Time, in seconds, for which a link opens something without a token: whoever was away for a day can still look."""
+
+LinkLifetimeS = Annotated[float, Field(ge=60, le=2_592_000)]
+"""Such a time in seconds, at most 30 days: a link cannot be taken back alone."""
+
 T = TypeVar("T")
 
 
@@ -233,6 +239,16 @@ class AlertAction(Model):
         return next(name for name in ("webhook", "mqtt", "command", "apprise") if getattr(self, name) is not None)
 
 
+class LinksConfig(Model):
+    """Links in alerts that open something without a token until they expire.
+
+    Recordings leave the building only where the site file says so.
+    """
+
+    of: tuple[Literal["picture", "clip"], ...] = ("picture",)
+    lifetime_s: LinkLifetimeS = LIFETIME_S
+
+
 class AlertsConfig(Model):
     """All rules and actions of a site."""
 
@@ -241,6 +257,7 @@ class AlertsConfig(Model):
     outbox: FileName | None = None
     timezone: str | None = None
     url: str | None = None
+    links: LinksConfig = LinksConfig()
 
     @field_validator("timezone")
     @classmethod

@@ -1,4 +1,4 @@
-"""What differs between two readings of a site file, by key, and which of it a running server can take over."""
+"""Differences between two readings of a site file, by key, and those that a running server can take over."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from livessl.site.models import Site
 from livessl.site.place import Place
 
 NEEDS_RESTART: Final[frozenset[Place]] = frozenset({("alerts", "outbox")})
-"""Keys within `RULES_AND_ZONES` that a running server cannot take over all the same."""
+"""Keys in `RULES_AND_ZONES` that nevertheless need a restart."""
 
 RULES_AND_ZONES: Final = ("zones", "alerts")
 """Sections that a running server takes over."""
@@ -45,7 +45,7 @@ def is_of_poses(place: Place) -> bool:
 
 
 def moved_arrays(before: Site, after: Site) -> list[str]:
-    """Return the arrays that both sites have at different places, which files of the site may say, too."""
+    """Return the arrays whose places differ, also because of a file that the site file names."""
     known = {spec.name: spec for spec in before.processed}
     return [spec.name for spec in after.processed if spec.name in known and not _is_same_place(known[spec.name], spec)]
 

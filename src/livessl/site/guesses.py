@@ -17,7 +17,7 @@ from livessl.core.types import ArraySpec, FloatArray
 from livessl.site.addresses import is_loopback
 from livessl.site.fields import Bounds
 from livessl.site.interfaces import known_interface
-from livessl.site.models import ArrayConfig, Shape, Site
+from livessl.site.models import ArrayConfig, Orientation, Shape, Site
 from livessl.site.node_models import NodeConfig, SoundDeviceConfig
 
 HOT_C: Final = 50.0
@@ -63,7 +63,7 @@ def unlikely(site: Site) -> Iterator[str]:
     yield from _temperature_and_speed(site)
     yield from _lengths(site)
     for name, array in site.arrays.items():
-        yield from _angles(name, array)
+        yield from _angles(f"arrays.{name}", array.orientation_deg)
     low, high = site.band_hz
     if high < 200.0 <= 1000.0 * high:
         yield (
@@ -202,9 +202,9 @@ def _lengths(site: Site) -> Iterator[str]:
                 yield f"{key}.bounds_m: {np.abs(bounds_m).max():g} m is far outside the room; {cure}"
 
 
-def _angles(name: str, array: ArrayConfig) -> Iterator[str]:
+def _angles(key: str, orientation_deg: Orientation | None) -> Iterator[str]:
     """Yield a warning for each angle that is a common angle in radians, but a strange one in degrees."""
-    for axis, angle in () if array.orientation_deg is None else array.orientation_deg:
+    for axis, angle in () if orientation_deg is None else orientation_deg:
         decimals = min(len(repr(abs(angle)).partition(".")[2]), 4)
         if decimals not in _STEP_DEG or abs(angle) > 2.0 * math.pi + 0.01:
             continue
@@ -212,8 +212,7 @@ def _angles(name: str, array: ArrayConfig) -> Iterator[str]:
         nearest = step * round(degrees / step)
         if nearest != 0.0 and abs(degrees - nearest) <= math.degrees(10.0**-decimals):
             yield (
-                f"arrays.{name}.orientation_deg.{axis}: {angle:g} degrees is unlikely; did you mean {nearest:g}, from "
-                "radians?"
+                f"{key}.orientation_deg.{axis}: {angle:g} degrees is unlikely; did you mean {nearest:g}, from radians?"
             )
 
 

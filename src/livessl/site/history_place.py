@@ -1,4 +1,4 @@
-"""Where the history is kept: `server.events_db` names an SQLite file, or a PostgreSQL database by its URL."""
+"""The place of the history: `server.events_db` names an SQLite file, or a PostgreSQL database by its URL."""
 
 from __future__ import annotations
 

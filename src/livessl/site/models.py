@@ -134,6 +134,18 @@ class Orientation(Model):
     pitch: Coordinate = 0.0
     roll: Coordinate = 0.0
 
+    @property
+    def named_deg(self) -> dict[str, float]:
+        """The angles as arguments of `livessl.core.geometry.posed`."""
+        return {"yaw_deg": self.yaw, "pitch_deg": self.pitch, "roll_deg": self.roll}
+
+
+class CameraConfig(Model):
+    """A camera that can be pointed: where it is, and how it is mounted; at rest it looks along its own +x axis."""
+
+    position_m: Position
+    orientation_deg: Orientation = Orientation()
+
 
 class UncertaintyConfig(Model):
     """Standard deviations of what is known of an array's set-up: see `livessl.core.types.Uncertainty`."""
@@ -231,6 +243,7 @@ class SiteFile(Model):
     zones_file: FileName | None = None
     floor_plan: FloorPlan | None = None
     alerts: AlertsConfig = AlertsConfig()
+    cameras: dict[str, CameraConfig] = Field(default_factory=dict)
 
     @field_validator("*", mode="wrap")
     @classmethod

@@ -77,7 +77,7 @@ class SinkConfig(Model):
 
 
 class ClipsConfig(Model):
-    """What is kept of the sound of located events."""
+    """Sound of located events that is kept."""
 
     folder: FileName
     pre_s: Annotated[float, Field(ge=0, le=5)] = 1.0

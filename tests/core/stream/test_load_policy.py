@@ -24,7 +24,7 @@ from livessl.core.stream.load_policy import (
 )
 
 TURN_NS = 20_000_000
-ORDER = ("updates", "maps", "arrays", "quiet")
+ORDER = ("updates", "second_looks", "maps", "arrays", "quiet")
 
 
 def hold(policy: LoadPolicy, seconds: float, delay_s: float, *, busy: float = 1.0, since_ns: int = 0) -> int:
@@ -70,7 +70,7 @@ def test_each_level_sheds_what_the_one_before_sheds_and_more() -> None:
         assert after.update_every is None or after.update_every >= before.update_every
 
 
-def test_updates_are_shed_first_then_maps_then_arrays_then_quiet() -> None:
+def test_updates_are_shed_first_then_second_looks_then_maps_then_arrays_then_quiet() -> None:
     first = [next(level for level, relief in enumerate(LEVELS) if name in relief.shed) for name in ORDER]
     assert first == sorted(set(first))
 

@@ -30,12 +30,14 @@ class Counting(Scripted):
         super().__init__()
         self.correlated: dict[str, int] = dict.fromkeys((spec.name for spec in ARRAYS), 0)
         self.given: list[dict[str, tuple[float, ...]]] = []
+        self.looked_again: list[set[bool]] = []
 
     def onset_front_end(self, array: str, sample_rate_hz: float) -> FrontEnd:  # type: ignore[override]
         return FrontEnd(self, array, sample_rate_hz)
 
     def locate(self, sounds: Mapping[str, Sound]) -> Localization:
         self.given.append({name: tuple(onset.weight for onset in sound.onsets) for name, sound in sounds.items()})
+        self.looked_again.append({sound.second_looks for sound in sounds.values()})
         heard = tuple(Evidence(spec, NOTHING) for spec in ARRAYS if spec.name in sounds)
         return Localization(SOURCE_M.copy(), 0.01 * np.eye(3), 0.9, heard, outliers={})
 
@@ -118,6 +120,17 @@ def test_the_least_number_of_arrays_is_never_shed() -> None:
     (event,) = events(run(fusion_with(counting, Relief(arrays=2), 20, min_arrays=5), sound({10, 11, 12}, 30, 0, 20)))
     assert event.status is Status.LOCATED
     assert len(counting.given[-1]) == 5
+
+
+@pytest.mark.parametrize("relief", [LEVELS[0], LEVELS[1], *LEVELS[2:5], Relief(second_looks=False)])
+def test_windows_and_events_allow_second_looks_unless_these_are_shed(relief: Relief) -> None:
+    counting = Counting()
+    state = state_of(counting, ARRAYS[:4])
+    state.relieve(relief)
+    outputs = run(TwoPassFusion(state, [spec.name for spec in ARRAYS[:4]]), sound(set(range(10, 40)), 60, 0, 4))
+    assert {type(output) for output in outputs} >= {Update, Event}
+    assert counting.looked_again
+    assert all(allowed == {relief.second_looks} for allowed in counting.looked_again)
 
 
 @pytest.mark.parametrize("every", [1, 2, 5, None])

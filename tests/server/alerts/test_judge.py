@@ -126,8 +126,7 @@ def test_events_that_became_final_before_a_crash_alert_after_it(tmp_path: Path) 
     wait_until(lambda: first.alerts.outbox.judged_until_ns("small") is not None, "the first start")
     first.finish(sound(1))
     wait_until(lambda: first.published, "the first alert")
-    first.alerts.stop()
-    first.alerts._thread = None  # from here on nobody judges, as after SIGKILL
+    first.alerts.stop()  # from here on nobody judges, as after SIGKILL
     first.finish(sound(2), refused(3), sound(4, ELSEWHERE), sound(5))
     first.store.close()
     with running_desk(site(tmp_path)) as desk:
@@ -144,7 +143,6 @@ def test_new_events_alert_while_the_past_cannot_be_read(tmp_path: Path) -> None:
     first.alerts.start()
     wait_until(lambda: first.alerts.outbox.judged_until_ns("small") is not None, "the first start")
     first.alerts.stop()
-    first.alerts._thread = None
     first.finish(sound(1))
     first.store.close()
     lost = {"arrays": {"lasts_s": 0}, "hold_off_s": 0}
@@ -204,7 +202,7 @@ def test_missed_events_alert_although_the_store_took_them_late(tmp_path: Path, m
             desk.finish(sound(number))
         desk.alerts.start()
         wait_until(lambda: len(alerted(desk)) == 2, "what is in the queue")
-        wait_until(lambda: not len(desk.alerts._backlog), "a look at what was missed")
+        wait_until(lambda: not desk.alerts.waiting, "a look at what was missed")
         desk.finish(sound(5))
     desk.finish(sound(6))  # the store takes everything
     wait_until(lambda: len(alerted(desk)) == 7, "all alerts")

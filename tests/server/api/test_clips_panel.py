@@ -24,6 +24,16 @@ CLIPPED = """
 """
 """Script that finds elements of the recordings whose text is wider than they are."""
 
+DRAWN = """
+const usual = CanvasRenderingContext2D.prototype.fillText;
+window.drawn = [];
+CanvasRenderingContext2D.prototype.fillText = function (text, ...more) {
+  window.drawn = [...window.drawn.slice(-999), text];
+  usual.call(this, text, ...more);
+};
+"""
+"""Script that notes the texts that are drawn on canvases."""
+
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
@@ -118,3 +128,41 @@ def test_viewer_sees_what_there_is_and_gets_no_button(
         clips = page.get_by_test_id("clips").last
         expect(clips).to_contain_text("Sign in as an operator to listen.", timeout=1000 * HANG_S)
         expect(clips.get_by_role("button")).to_have_count(0)
+
+
+def test_operator_locates_an_event_again_and_sees_both_answers(
+    browser: Browser, server: Server, tokens: tuple[Path, dict[str, str]]
+) -> None:
+    with faultless_page(browser) as page:
+        page.add_init_script(DRAWN)
+        visit(page, server.url)
+        page.get_by_label("Access token").fill(tokens[1]["operator"])
+        page.get_by_role("button", name="Sign in").click()
+        event = page.get_by_test_id("event").last
+        event.locator(".summary").click(timeout=1000 * HANG_S)
+        form = event.get_by_role("form", name="Locate again")
+        expect(form).to_be_visible(timeout=1000 * HANG_S)
+        method = form.get_by_label("Method")
+        expect(method.get_by_role("option")).to_have_text(["onset", "srp-phat", "cepstral", "averaged"])
+        expect(method).to_have_value("srp-phat")
+        form.get_by_role("button", name="Locate").click()
+        rows = form.get_by_role("row")
+        expect(rows.nth(1)).to_have_text("methodonsetsrp-phat", timeout=1000 * HANG_S)
+        expect(rows.nth(2)).to_have_text("statuslocatedlocated")
+        expect(form.get_by_role("status")).to_contain_text("The positions are 0.")
+        page.wait_for_function("() => window.drawn.includes('again: srp-phat')", timeout=1000 * HANG_S)
+        for width in (1440, 1280, 820, 390):
+            page.set_viewport_size({"width": width, "height": 900})
+            assert page.evaluate(CLIPPED) == [], width
+        event.locator(".summary").click()  # closes it: its marks go
+        page.locator("h1").hover()
+        page.wait_for_function(
+            "() => { const before = window.drawn; window.drawn = []; return before.length && "
+            "!before.includes('again: srp-phat'); }",
+            timeout=1000 * HANG_S,
+        )
+        page.route("**/relocate", lambda route: route.fulfill(status=503, json={"detail": "the server is overloaded"}))
+        event.locator(".summary").click()
+        form.get_by_role("button", name="Locate").click()
+        expect(form.get_by_role("status")).to_have_text("Not located: the server is overloaded", timeout=1000 * HANG_S)
+        expect(form.get_by_role("table")).to_have_count(0)

@@ -39,6 +39,28 @@ def test_every_frame_is_at_its_time_and_the_rest_is_a_gap(indices: list[int]) ->
     assert round(missing_s / FRAME_S) == indices[-1] - first + 1 - len(indices)
 
 
+@given(
+    indices=st.lists(st.integers(0, 40), min_size=1, max_size=20, unique=True).map(sorted),
+    ahead=st.integers(-9, 9),
+    longer=st.sets(st.integers(0, 40)),
+)
+def test_every_frame_can_be_taken_out_again(indices: list[int], ahead: int, longer: set[int]) -> None:
+    """Also those of another length, and with a clock that is ahead by whole frames."""
+    given = [
+        replace(one, samples=np.concatenate([one.samples, one.samples[:, :1]], axis=1))
+        if one.frame_index in longer
+        else one
+        for one in frames(indices, set(indices[::2]))
+    ]
+    made = cut(NORTH, given, ahead * FRAME_NS, ahead)
+    assert made is not None
+    for frame_of, placed in zip(given, made.frames, strict=True):
+        taken = made.samples[:, placed.begin : placed.begin + placed.length]
+        np.testing.assert_array_equal(taken, frame_of.samples)
+        assert placed.frame_index == frame_of.frame_index - ahead
+        assert (placed.power, placed.active, placed.requested) == (frame_of.power, frame_of.active, frame_of.requested)
+
+
 def test_frames_of_another_length_are_joined_without_a_gap() -> None:
     """A device's clock that drifts makes a frame one sample longer now and then."""
     parts = frames([3, 4, 5])

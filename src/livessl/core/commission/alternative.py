@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-LEAST_TURN_DEG: Final = 4.0
+LEAST_TURN_DEG: Final = 3.0
 """Smallest turn that is told."""
 
 LEAST_SHIFT_M: Final = 0.1

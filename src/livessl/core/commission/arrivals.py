@@ -16,7 +16,7 @@ ARRIVAL_STD_S: Final = 60e-6
 
 @dataclass(frozen=True, slots=True)
 class Arrivals:
-    """When some arrays received some sounds.
+    """Times at which some arrays received some sounds.
 
     Parameters
     ----------

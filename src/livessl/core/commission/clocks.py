@@ -45,7 +45,7 @@ _LARGE: Final = 0.2
 
 @dataclass(frozen=True, slots=True)
 class Rises:
-    """When the sound in a recording rises.
+    """Times at which the sound in a recording rises.
 
     Parameters
     ----------

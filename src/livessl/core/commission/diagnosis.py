@@ -17,25 +17,21 @@ import numpy as np
 
 from livessl.core.commission.alternative import Alternative
 from livessl.core.commission.finding import LEAST_SOUNDS
-from livessl.core.commission.judge import COSTS, Judge
+from livessl.core.commission.judge import Judge, least_gain
 from livessl.core.commission.places import Delays, KnownPlaces, Microphones, PlaceSearch, contradictions_s
+from livessl.core.commission.set_up import Known, careful
 from livessl.core.commission.trial import FLOOR_S as KNOWN_FLOOR_S
 from livessl.core.commission.trial import Trial
-from livessl.core.types import FloatArray
-
-MIN_GAIN: Final = 9.0
-GAIN_PER_ARRAY: Final = 1.0
-"""Least gain in the deviance of sounds at unknown places from which a set-up is said to be other than filed, and what
-is added to it for each array beyond the first, because more arrays have more alternatives. Few careful set-ups exceed
-it by chance (`benchmarks/doctor_chance.py`)."""
+from livessl.core.types import FloatArray, IntArray
 
 MIN_LEAD: Final = 6.0
-MIN_LEAD_OF_GAIN: Final = 0.12
+MIN_LEAD_OF_GAIN: Final = 0.06
 """Least lead in the same measure over the best alternative about another array or channel, and the same as a share of
 the gain: where much is explained by either of two, what distinguishes them may be the errors of the delays."""
 
 EQUAL: Final = 0.5
-"""Share of the least lead within which alternatives explain the sounds equally well."""
+"""Share of `MIN_LEAD` within which alternatives explain the sounds equally well; where much is explained, all do that
+are within the least lead."""
 
 KNOWN_MIN_GAIN: Final = 12.0
 KNOWN_MIN_LEAD: Final = 6.0
@@ -74,6 +70,8 @@ class Diagnosis:
         Whether the sounds contradict the set-up as filed, explained or not.
     lead : float
         Lead of the best alternative over the set-up as filed and over alternatives of other arrays, in the criterion.
+    gained : float
+        Lead of the first rival over the set-up as filed.
     undecided : tuple of Alternative
         Two or more that are the same fault of different arrays and explain the sounds equally well, best first: one of
         them is true.
@@ -85,6 +83,7 @@ class Diagnosis:
     rivals: tuple[Alternative, ...]
     contradicts: bool
     lead: float = 0.0
+    gained: float = 0.0
     undecided: tuple[Alternative, ...] = ()
 
     @property
@@ -93,7 +92,9 @@ class Diagnosis:
         return float(1.0 / (1.0 + np.exp(-self.lead / 2.0)))
 
 
-def diagnose(microphones: Microphones, delays: Delays, bounds_m: FloatArray, c_m_s: float) -> Diagnosis:
+def diagnose(
+    microphones: Microphones, delays: Delays, bounds_m: FloatArray, c_m_s: float, known: Known | None = None
+) -> Diagnosis:
     """Compare the set-up as filed with its alternatives, by sounds at unknown places.
 
     Parameters
@@ -106,12 +107,16 @@ def diagnose(microphones: Microphones, delays: Delays, bounds_m: FloatArray, c_m
         Search volume, metres.
     c_m_s : float
         Speed of sound as filed, m/s.
+    known : Known or None
+        How exactly the set-up and the delays are known; None for a careful set-up in a room.
     """
+    known = known or Known(careful(microphones))
     search, arrays = PlaceSearch(bounds_m, c_m_s), len(microphones)
     if arrays > MOST_ARRAYS:
-        names = most_doubtful(microphones, most_telling(delays), search)
+        names = most_doubtful(microphones, of_sounds(delays, most_telling(delays)), search)
         microphones, delays = ({name: of[name] for name in names} for of in (microphones, delays))
-    judge = Judge(microphones, most_telling(delays), search)
+    rows = most_telling(delays)
+    judge = Judge(microphones, of_sounds(delays, rows), search, known.of_sounds(rows))
     if judge.sounds < LEAST_SOUNDS or judge.arrays < 2:
         return Diagnosis(judge.sounds, judge.misfit_s, None, (), contradicts=False)
     return _by_judge(judge, arrays)
@@ -132,14 +137,18 @@ def verify(microphones: Microphones, delays: Delays, places_m: FloatArray, c_m_s
     return _by_criterion(Trial(microphones, delays, KnownPlaces(places_m, c_m_s)))
 
 
-def most_telling(delays: Delays) -> dict[str, FloatArray]:
-    """Return the delays of at most `MOST_SOUNDS` sounds: those that most channels received, over the whole time."""
+def most_telling(delays: Delays) -> IntArray:
+    """Return the indices of at most `MOST_SOUNDS` sounds: those that most channels received, over the whole time."""
     received = np.sum([np.isfinite(one).sum(axis=1) for one in delays.values()], axis=0)
     if len(received) <= MOST_SOUNDS:
-        return dict(delays)
+        return np.arange(len(received))
     able = np.flatnonzero(received >= np.sort(received)[-MOST_SOUNDS])
-    used = able[np.linspace(0, len(able) - 1, MOST_SOUNDS).round().astype(int)]
-    return {name: one[used] for name, one in delays.items()}
+    return np.asarray(able[np.linspace(0, len(able) - 1, MOST_SOUNDS).round().astype(int)])
+
+
+def of_sounds(delays: Delays, rows: IntArray) -> dict[str, FloatArray]:
+    """Return the delays of some of the sounds."""
+    return {name: one[rows] for name, one in delays.items()}
 
 
 def most_doubtful(microphones: Microphones, delays: Delays, search: PlaceSearch) -> list[str]:
@@ -185,16 +194,17 @@ def _by_criterion(trial: Trial) -> Diagnosis:
 
 def _by_judge(judge: Judge, arrays: int) -> Diagnosis:
     """Compare alternatives with the freedom of a careful set-up; the judged arrays were chosen from so many."""
-    least = MIN_GAIN + GAIN_PER_ARRAY * (arrays - 1)
+    least = least_gain(arrays)
     misfit_s = judge.misfit_s
-    if misfit_s <= MIN_RATIO * FLOOR_S and not judge.may_gain(least + COSTS["turned"]):
+    if misfit_s <= MIN_RATIO * FLOOR_S and not judge.may_gain(least):
         return Diagnosis(judge.sounds, misfit_s, None, (), contradicts=False)
     rivals = judge.judged()
     gained = judge.filed - rivals[0].criterion
     contradicts = gained > least and rivals[0].is_large  # smaller errors are those of a careful set-up
     rivals[0] = judge.with_misfit(rivals[0])
     least_lead = max(MIN_LEAD, MIN_LEAD_OF_GAIN * gained)
-    return _decided(judge.sounds, misfit_s, rivals, gained, contradicts, least_lead, EQUAL * least_lead)
+    apart = max(EQUAL * MIN_LEAD, MIN_LEAD_OF_GAIN * gained)
+    return _decided(judge.sounds, misfit_s, rivals, gained, contradicts, least_lead, apart)
 
 
 def _decided(
@@ -219,6 +229,7 @@ def _decided(
         tuple(rivals),
         contradicts,
         min(gained, lead),
+        gained,
         undecided,
     )
 

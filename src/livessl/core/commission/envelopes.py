@@ -1,4 +1,4 @@
-"""When the sound of a recording rises: what recordings by different clocks are compared by.
+"""Rises of the sound in a recording, by which recordings of different clocks are compared.
 
 Where and how loud a sound is heard changes its level and its reverberation, but hardly the moments at which its power
 rises above all that came shortly before.
@@ -73,7 +73,7 @@ class EnvelopeMeter:
         self._waiting, self._at, self._count = [samples[:, edges[-1] :]], self._at + int(edges[-1]), last
 
     def rises(self) -> FloatArray:
-        """By how much the power of each piece exceeds the decay of all before it, in nepers of power, (n,)."""
+        """Return how far each piece exceeds the decay of all pieces before it, in nepers of power, (n,)."""
         self._measure()
         if not self._pieces:
             return np.zeros(0)

@@ -10,13 +10,18 @@ import numpy as np
 from livessl.core.commission.alternative import Alternative
 from livessl.core.commission.diagnosis import Diagnosis, diagnose
 from livessl.core.commission.finding import LEAST_SOUNDS, Finding, Severity, in_order
-from livessl.core.commission.places import Microphones, stacked
+from livessl.core.commission.places import Delays, Microphones, stacked
+from livessl.core.commission.set_up import DELAY_STD_S, Freedom, Known, careful
 from livessl.core.types import BoolArray, FloatArray, Observation
 
 OF_SET_UP: Final = frozenset(
     {"swapped", "mirrored", "exchanged", "turned", "moved", "late_channel", "geometry", "temperature"}
 )
 """Codes of what the delays of all sounds show together."""
+
+EXACT_S: Final = 2e-6
+"""Standard deviation, in seconds, of a delay whose pairs agree perfectly: converters and microphones differ by as
+much."""
 
 LEAST_SHARPNESS: Final = 3.5
 """Sharpness below which an observation counts for nothing: noise alone gives up to 3."""
@@ -47,7 +52,11 @@ SILENT: Final = 1e-9
 
 
 def find_faults(
-    microphones: Microphones, sounds: Sequence[Sequence[Observation]], bounds_m: FloatArray, c_m_s: float
+    microphones: Microphones,
+    sounds: Sequence[Sequence[Observation]],
+    bounds_m: FloatArray,
+    c_m_s: float,
+    freedom: Mapping[str, Freedom] | None = None,
 ) -> list[Finding]:
     """Find what is wrong with a set-up.
 
@@ -61,12 +70,16 @@ def find_faults(
         Search volume, metres.
     c_m_s : float
         Speed of sound as the site file has it, m/s.
+    freedom : mapping of array to Freedom, or None
+        How exactly the set-up is known; None for a careful one.
     """
     findings = channel_findings(microphones, sounds)
-    delays = sharp_delays(microphones, [sound for sound in sounds if len(sound) > 1], findings)
+    joint = [sound for sound in sounds if len(sound) > 1]
+    delays = sharp_delays(microphones, joint, findings)
+    known = Known(freedom or careful(microphones), stds_s(delays, joint))
     microphones = {array: microphones[array] for array in delays}
     if len(microphones) > 1 and len(next(iter(delays.values()))) >= LEAST_SOUNDS:
-        findings += set_up_findings(diagnose(microphones, delays, bounds_m, c_m_s))
+        findings += set_up_findings(diagnose(microphones, delays, bounds_m, c_m_s, known))
     return in_order(findings)
 
 
@@ -92,6 +105,19 @@ def sharp_delays(
             unusable[finding.array][finding.channel - 1] = True
     delays = stacked([_usable(sound, unusable) for sound in sounds], microphones)
     return {array: measured for array, measured in delays.items() if np.isfinite(measured).any()}
+
+
+def stds_s(delays: Delays, sounds: Sequence[Sequence[Observation]]) -> dict[str, FloatArray]:
+    """Return how exact the delays of each array are, (S,) seconds: about as exact as its pairs agree with each other.
+
+    Two channels are one pair, which agrees with itself however wrong it is.
+    """
+    found = {name: np.full(len(sounds), DELAY_STD_S) for name in delays}
+    for row, sound in enumerate(sounds):
+        for one in sound:
+            if one.array in found and np.isfinite(one.delays_s).sum() > 2:
+                found[one.array][row] = float(np.hypot(EXACT_S, one.closure_s))
+    return found
 
 
 def _usable(sound: Sequence[Observation], unusable: Mapping[str, BoolArray]) -> dict[str, FloatArray]:

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from livessl.core.commission.alternative import Alternative
 from livessl.core.commission.finding import LEAST_SOUNDS
 from livessl.core.commission.places import Delays, Microphones, PlaceSearch, centred
-from livessl.core.commission.set_up import Freedom, SetUp, careful
+from livessl.core.commission.set_up import Freedom, Known, SetUp
 from livessl.core.types import Float32Array, FloatArray, IntArray
 
 ALL_ORDERS: Final = 4
@@ -31,6 +31,13 @@ MIN_FOR_ONE: Final = 4
 
 YAWS_DEG: Final = tuple(np.arange(-180.0, 180.0, 20.0).tolist())
 """Turns about the vertical, in degrees, that are tried on the grid, the right way up and upside down."""
+
+UPRIGHT_COST: Final = 2.0
+"""Deviance that a turn about the vertical alone must gain: it has one unknown, and is what people get wrong."""
+
+FREER_COST: Final = 8.0
+"""Deviance that a set-up must gain in which the pose or all microphones of an array are free: as much as a fault of
+three unknowns must. The faults of one unknown that it covers are larger where they are told."""
 
 FREE_M: Final = 1.0
 FREE_DEG: Final = 60.0
@@ -53,12 +60,15 @@ class Hypothesis:
         Places of the sounds to begin at, metres.
     but : (str, int) or None
         Array and index of a channel that these places are found without.
+    cost : float or None
+        What it must gain, where that is not what alternatives of its fault must gain.
     """
 
     alternative: Alternative | None
     set_up: SetUp
     starts_m: FloatArray
     but: tuple[str, int] | None = None
+    cost: float | None = None
 
 
 class Hypotheses:
@@ -71,13 +81,15 @@ class Hypotheses:
     delays : mapping of array to (S, K) float64
         Seconds.
     search : PlaceSearch
+    known : Known
     """
 
-    def __init__(self, microphones: Microphones, delays: Delays, search: PlaceSearch) -> None:
+    def __init__(self, microphones: Microphones, delays: Delays, search: PlaceSearch, known: Known) -> None:
         self._microphones, self._delays, self._search = microphones, delays, search
         self._tables = {name: search.tables_s(at_m[None]) for name, at_m in microphones.items()}
         self._costs = {name: _costs(self._tables[name], one)[0] for name, one in delays.items()}
-        self._filed = SetUp(microphones, delays, search.c_m_s, careful(microphones))
+        self._freedom = {name: known.freedom[name] for name in microphones}
+        self._filed = SetUp(microphones, delays, search.c_m_s, self._freedom, stds_s=known.stds_s)
         self._starts_m = self._at_lowest(self._all_but())
 
     def filed(self) -> Hypothesis:
@@ -85,26 +97,30 @@ class Hypotheses:
         return Hypothesis(None, self._filed, self._starts_m)
 
     def freer(self, places_m: FloatArray) -> list[Hypothesis]:
-        """Return set-ups that are at least as free as any that is nearly as filed.
+        """Return set-ups that are at least as free as any that is nearly as filed, with what they must gain.
 
-        The pose, and then the microphones, of one array after the other are left free together, and the speed of sound.
-        They say how much there is to gain. `places_m` (S, 3) are those of the filed set-up.
+        The pose, and then the microphones, of one array after the other are left free together, and the speed of sound;
+        then its turn about the vertical alone, which must gain less. They say how much there is to gain. `places_m`
+        (S, 3) are those of the filed set-up.
         """
         freer = []
-        for name, own in careful(self._microphones).items():
+        for name, own in self._freedom.items():
             for freed in (
-                replace(own, position_m=FREE_M, orientation_deg=FREE_DEG),
+                replace(own, position_m=FREE_M, orientation_deg=np.full(3, FREE_DEG)),
                 replace(own, microphones_m=np.full(len(own.microphones_m), FREE_MICROPHONE_M)),
             ):
                 set_up = replace(self._with(name, freed), speed_std_m_s=FREE_SPEED_M_S)
-                freer.append(Hypothesis(None, set_up, places_m))
+                freer.append(Hypothesis(None, set_up, places_m, cost=FREER_COST))
+            freer.append(Hypothesis(None, self._with(name, _upright(own)), places_m, cost=UPRIGHT_COST))
         return freer
 
     def near(self, places_m: FloatArray) -> Iterator[Hypothesis]:
         """Yield the alternatives that are fitted from the filed set-up and its places (S, 3), metres."""
-        for name, own in careful(self._microphones).items():
+        for name, own in self._freedom.items():
+            upright = self._with(name, _upright(own))
+            yield Hypothesis(_alternative("turned", name), upright, places_m, cost=UPRIGHT_COST)
             for freed, fault in (
-                (replace(own, orientation_deg=FREE_DEG), "turned"),
+                (replace(own, orientation_deg=np.full(3, FREE_DEG)), "turned"),
                 (replace(own, position_m=FREE_M), "moved"),
             ):
                 yield Hypothesis(_alternative(fault, name), self._with(name, freed), places_m)
@@ -172,7 +188,10 @@ class Hypotheses:
         for name in (one, other):
             costs = costs + _costs(self._tables[name], delays[name])[0]
         alternative = replace(_alternative("exchanged", one), other=other)
-        return Hypothesis(alternative, replace(self._filed, delays=delays), self._at_lowest(costs))
+        stds_s = dict(self._filed.stds_s)
+        if one in stds_s and other in stds_s:
+            stds_s |= {one: stds_s[other], other: stds_s[one]}
+        return Hypothesis(alternative, replace(self._filed, delays=delays, stds_s=stds_s), self._at_lowest(costs))
 
     def _best_turn(self, name: str) -> Hypothesis | None:
         """Return the array turned as the grid says best; None if that is as filed."""
@@ -186,13 +205,13 @@ class Hypotheses:
         turn, starts_m = turns[best], self._at_lowest(costs[best])
         if turn.magnitude() == 0.0:
             return None
-        own = replace(careful(self._microphones)[name], orientation_deg=FREE_DEG)
+        own = replace(self._freedom[name], orientation_deg=np.full(3, FREE_DEG))
         turned = dict(self._microphones) | {name: turned_m[best]}
         alternative = replace(_alternative("turned", name), turn_deg=_three(np.degrees(turn.as_rotvec())))
         return Hypothesis(alternative, replace(self._with(name, own), microphones=turned), starts_m)
 
     def _with(self, name: str, freedom: Freedom) -> SetUp:
-        return replace(self._filed, freedom=self._filed.freedom | {name: freedom})
+        return replace(self._filed, freedom=self._freedom | {name: freedom})
 
     def _all_but(self, *left_out: str) -> Float32Array:
         """Sum of the costs (S, G) of the other arrays."""
@@ -202,6 +221,11 @@ class Hypotheses:
 
     def _at_lowest(self, costs: Float32Array) -> FloatArray:
         return np.asarray(self._search.points_m[costs.argmin(axis=-1)])
+
+
+def _upright(own: Freedom) -> Freedom:
+    """Return the freedom of an array that may be turned about the vertical."""
+    return replace(own, orientation_deg=np.array([*own.orientation_deg[:2], FREE_DEG]))
 
 
 def _alternative(fault: str, array: str | None = None, channel: int | None = None) -> Alternative:

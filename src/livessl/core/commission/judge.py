@@ -17,7 +17,7 @@ from livessl.core.commission.alternative import Alternative
 from livessl.core.commission.hypotheses import Hypotheses, Hypothesis
 from livessl.core.commission.places import Delays, Microphones, PlaceSearch
 from livessl.core.commission.poses import moved
-from livessl.core.commission.set_up import SetUp, Stacked
+from livessl.core.commission.set_up import Known, SetUp, Stacked, careful
 from livessl.core.commission.tolerance import Explained, explained, unknowns_of
 from livessl.core.types import FloatArray
 
@@ -25,14 +25,14 @@ COSTS: Final = {
     "exchanged": 1.0,
     "late_channel": 2.0,
     "geometry": 8.0,
-    "turned": 6.0,
+    "turned": 8.0,
     "moved": 8.0,
     "height": 2.0,
     "temperature": 2.0,
 }
 """Deviance that an alternative must gain to be as good as the set-up as filed: two for each unknown (Akaike), one for
-each channel in another order. A shift costs two more, because people measure distances better than angles, and a
-microphone does, because there are many."""
+each channel in another order. A shift and a turn about any axis cost two more, because people mistake the turn about
+the vertical most (`UPRIGHT_COST`), and a microphone does, because there are many."""
 
 MOST_SLOPES: Final = 500_000
 """Most slopes (set-ups by sounds by channels by unknowns) of one array that are computed at one time: 4 MB."""
@@ -40,6 +40,19 @@ MOST_SLOPES: Final = 500_000
 MOST_NORMAL: Final = 8_000_000
 """Most numbers in the normal equations of the set-ups that are fitted at one time: 64 MB. Their unknowns are those of
 all arrays, so one set-up of 30 arrays has 300 000."""
+
+
+MIN_GAIN: Final = 7.0
+"""Least gain in the deviance of sounds at unknown places from which a set-up of one array would be said to be other
+than filed. Few careful set-ups exceed what follows from it by chance (`benchmarks/doctor_chance.py`)."""
+
+
+def least_gain(arrays: int) -> float:
+    """Return the least gain in the deviance from which a set-up is said to be other than filed.
+
+    More arrays have more alternatives, of which chance gains more: twice the logarithm of their number (Bonferroni).
+    """
+    return MIN_GAIN + 2.0 * float(np.log(arrays))
 
 
 class Judge:
@@ -52,11 +65,15 @@ class Judge:
     delays : mapping of array to (S, K) float64
         Seconds.
     search : PlaceSearch
+    known : Known or None
+        How exactly the set-up and the delays are known; None for a careful set-up in a room.
     """
 
-    def __init__(self, microphones: Microphones, delays: Delays, search: PlaceSearch) -> None:
+    def __init__(
+        self, microphones: Microphones, delays: Delays, search: PlaceSearch, known: Known | None = None
+    ) -> None:
         self.arrays, self.sounds, self._search = len(microphones), len(next(iter(delays.values()))), search
-        self._hypotheses = Hypotheses(microphones, delays, search)
+        self._hypotheses = Hypotheses(microphones, delays, search, known or Known(careful(microphones)))
         self._as_filed = self._hypotheses.filed()
         [self._filed] = self._fitted([self._as_filed])
 
@@ -71,15 +88,16 @@ class Judge:
         return self._misfit_s(self._as_filed.set_up)
 
     def may_gain(self, least: float) -> bool:
-        """Return whether a set-up that is nearly as filed may explain the sounds better by so much."""
+        """Return whether a set-up that is nearly as filed may explain the sounds better by so much, and its cost."""
         freer = self._hypotheses.freer(self._filed.places_m)
-        return any(self.filed - found.deviance >= least for found in self._fitted(freer))
+        found = zip(freer, self._fitted(freer), strict=True)
+        return any(self.filed - fit.deviance >= least + (one.cost or 0.0) for one, fit in found)
 
     def judged(self) -> list[Alternative]:
         """Return the alternatives, the best first, each with its criterion and its size as the sounds say best."""
         tried = [*self._hypotheses.near(self._filed.places_m), *self._hypotheses.far()]
         found = zip(tried, self._fitted(tried), strict=True)
-        judged = (_adjusted(one.alternative, fit) for one, fit in found if one.alternative is not None)
+        judged = (_adjusted(one.alternative, fit, one.cost) for one, fit in found if one.alternative is not None)
         return sorted(judged, key=lambda one: one.criterion)
 
     def with_misfit(self, alternative: Alternative) -> Alternative:
@@ -133,10 +151,12 @@ def _applied(filed: SetUp, alternative: Alternative) -> SetUp:
     return replace(filed, microphones=microphones, delays=delays, c_m_s=c_m_s)
 
 
-def _adjusted(alternative: Alternative, found: Explained) -> Alternative:
+def _adjusted(alternative: Alternative, found: Explained, cost: float | None) -> Alternative:
     """Return an alternative with its criterion, and with the change that was found for what it leaves free."""
     others = sum(channel != index for index, channel in enumerate(alternative.order, start=1))
-    judged = replace(alternative, criterion=found.deviance + COSTS.get(alternative.fault, others))
+    judged = replace(
+        alternative, criterion=found.deviance + (COSTS.get(alternative.fault, others) if cost is None else cost)
+    )
     name = alternative.array
     if alternative.fault == "turned" and name is not None:
         first, then = (Rotation.from_rotvec(np.radians(one)) for one in (alternative.turn_deg, found.turns_deg[name]))

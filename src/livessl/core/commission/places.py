@@ -41,7 +41,7 @@ _LEAST_M: Final = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class Places:
-    """Where some sounds were, and how well that explains their delays.
+    """Positions of some sounds, and how well they explain the delays.
 
     Parameters
     ----------

@@ -50,7 +50,7 @@ _SPEED_SCALE_M_S: Final = 3.0
 
 @dataclass(frozen=True, slots=True)
 class Freedom:
-    """How far the set-up may differ from the site file.
+    """Limits within which the set-up may differ from the site file.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ class Freedom:
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """How far an array is from where the site file says it is.
+    """Difference between the pose of an array and that of the site file.
 
     Parameters
     ----------

@@ -307,7 +307,7 @@ def from_known_places(
 
 
 def _contradictions(points_m: FloatArray, places_m: FloatArray, directions: FloatArray) -> FloatArray:
-    """How badly the best turn takes directions (S, 3) to those from each point towards the places, (G,).
+    """Return how badly the best turn takes directions (S, 3) to those from each point towards the places, (G,).
 
     The turn itself is not needed: the least sum of squares follows from the singular values of the sum of outer
     products (Wahba's problem; Markley 1988).

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
 
 from livessl.core.commission.places import LEAST_DAMPING, LEAST_SLOPE, Delays, Microphones
-from livessl.core.types import BoolArray, FloatArray
+from livessl.core.types import BoolArray, FloatArray, IntArray
 
 POSITION_STD_M: Final = 0.02
 ORIENTATION_STD_DEG: Final = 1.2
 MICROPHONE_STD_M: Final = 0.002
 SPEED_STD_M_S: Final = 1.5
 """Standard deviations of a careful set-up, along each axis: metres, degrees, metres and m/s."""
+
+DELAY_STD_S: Final = 6e-6
+"""Standard deviation, in seconds, of a delay in a room that is no outlier, where nothing else is known of it."""
 
 _STEPS: Final = 25
 """Most steps of the refinement of places, which ends after a handful."""
@@ -31,14 +34,16 @@ class Freedom:
 
     Parameters
     ----------
-    position_m, orientation_deg : float
-        Metres and degrees.
+    position_m : float
+        Metres.
+    orientation_deg : (3,) float64
+        About x, y and z, degrees.
     microphones_m : (K,) float64
         Of each microphone, metres.
     """
 
     position_m: float
-    orientation_deg: float
+    orientation_deg: FloatArray
     microphones_m: FloatArray
 
 
@@ -57,22 +62,46 @@ class SetUp:
     freedom : mapping of array to Freedom
     late : (str, int) or None
         Array and index of a channel that may have any delay.
+    stds_s : mapping of array to (S,) float64
+        Standard deviations of the delays of each sound, seconds; `DELAY_STD_S` for arrays that it leaves out.
     """
 
     microphones: Microphones
     delays: Delays
     c_m_s: float
-    freedom: dict[str, Freedom]
+    freedom: Mapping[str, Freedom]
     speed_std_m_s: float = SPEED_STD_M_S
     late: tuple[str, int] | None = None
+    stds_s: Mapping[str, FloatArray] = field(default_factory=dict)
 
 
-def careful(microphones: Microphones) -> dict[str, Freedom]:
-    """Return the freedom of arrays that were set up with care."""
+def careful(
+    microphones: Microphones, position_std_m: float = POSITION_STD_M, orientation_std_deg: float = ORIENTATION_STD_DEG
+) -> dict[str, Freedom]:
+    """Return the freedom of arrays that were set up with care, or as exactly as these standard deviations say."""
     return {
-        name: Freedom(POSITION_STD_M, ORIENTATION_STD_DEG, np.full(len(at_m), MICROPHONE_STD_M))
+        name: Freedom(position_std_m, np.full(3, orientation_std_deg), np.full(len(at_m), MICROPHONE_STD_M))
         for name, at_m in microphones.items()
     }
+
+
+@dataclass(frozen=True, slots=True)
+class Known:
+    """How exactly a set-up and the delays of some sounds in it are known.
+
+    Parameters
+    ----------
+    freedom : mapping of array to Freedom
+    stds_s : mapping of array to (S,) float64
+        Standard deviations of the delays of each sound, seconds; `DELAY_STD_S` for arrays that it leaves out.
+    """
+
+    freedom: Mapping[str, Freedom]
+    stds_s: Mapping[str, FloatArray] = field(default_factory=dict)
+
+    def of_sounds(self, rows: IntArray) -> Known:
+        """Return what is known of some of the sounds."""
+        return Known(self.freedom, {name: one[rows] for name, one in self.stds_s.items()})
 
 
 class Stacked:
@@ -93,6 +122,8 @@ class Stacked:
         Whether a channel has a delay of a sound.
     measured_s : dict of array to (H, S, K) float64
         Delays against the mean of the array's channels, seconds.
+    std_s : dict of array to (H, S) float64
+        Standard deviations of the delays, seconds.
     c_m_s : (H,) float64
         Metres per second.
     """
@@ -104,10 +135,13 @@ class Stacked:
         self.c_m_s = np.array([one.c_m_s for one in set_ups])
         self.there: dict[str, BoolArray] = {}
         self.measured_s: dict[str, FloatArray] = {}
+        self.std_s: dict[str, FloatArray] = {}
         for name in self.names:
             delays_s = np.stack([one.delays[name] for one in set_ups])
             self.there[name] = np.isfinite(delays_s)
             self.measured_s[name] = centred_where(delays_s, self.there[name])
+            unknown_s = np.full(delays_s.shape[1], DELAY_STD_S)
+            self.std_s[name] = np.stack([one.stds_s.get(name, unknown_s) for one in set_ups])
 
     def placed(self, starts_m: FloatArray, but: Sequence[tuple[str, int] | None] = ()) -> FloatArray:
         """Find the places (H, S, 3) that explain the delays best, the set-ups exactly as given, metres.

@@ -18,10 +18,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from livessl.core.commission.set_up import SetUp, Stacked, away, centred_rows, centred_where, inverse
-from livessl.core.types import FloatArray
-
-DELAY_STD_S: Final = 6e-6
-"""Standard deviation of a delay in a room that is no outlier, seconds."""
+from livessl.core.types import FloatArray, IntArray
 
 TAILS: Final = 3.0
 """Degrees of freedom of the t distribution of delays: 3 has heavy tails."""
@@ -29,9 +26,9 @@ TAILS: Final = 3.0
 FREE_LATE_S: Final = 1e-3
 """Standard deviation of the delay of a channel that may have any, seconds."""
 
-WIDER: Final = (8.0, 4.0, 2.0)
-"""Factors on `DELAY_STD_S` in the first steps, so that a set-up that is far from the sounds is drawn to them although
-they are all in the tails."""
+FIRST_STDS_S: Final = (48e-6, 24e-6, 12e-6)
+"""Least standard deviations of the delays in the first steps, seconds, so that a set-up that is far from the sounds is
+drawn to them although they are all in the tails."""
 
 MOST_STEPS: Final = 8
 """Steps of a fit beyond the first ones."""
@@ -132,9 +129,9 @@ class Fit:
 
     def run(self) -> None:
         """Fit until no deviance changes any more."""
-        for step in range(len(WIDER) + MOST_STEPS):
+        for step in range(len(FIRST_STDS_S) + MOST_STEPS):
             before = self.deviances
-            self._step(WIDER[step] if step < len(WIDER) else 1.0)
+            self._step(FIRST_STDS_S[step] if step < len(FIRST_STDS_S) else 0.0)
             self._off = self._residuals()
             deviances = self._deviances()
             better = deviances < before
@@ -144,7 +141,7 @@ class Fit:
                 np.where(better[:, None, None], self._places_m, places_m),
                 np.where(better[:, None], self._unknowns, unknowns),
             )
-            if step >= len(WIDER) and (before - self.deviances).max() < _ENOUGH:
+            if step >= len(FIRST_STDS_S) and (before - self.deviances).max() < _ENOUGH:
                 break
 
     def results(self) -> list[Explained]:
@@ -169,7 +166,7 @@ class Fit:
         parts = []
         for name in self._columns:
             own = one.freedom[name]
-            parts += [np.full(3, own.position_m), np.full(3, np.radians(own.orientation_deg))]
+            parts += [np.full(3, own.position_m), np.radians(own.orientation_deg)]
             parts.append(np.repeat(own.microphones_m, 3))
         return np.concatenate([*parts, [one.speed_std_m_s, FREE_LATE_S if one.late is not None else 0.0]])
 
@@ -194,7 +191,7 @@ class Fit:
             self._away[name] = away(self._places_m, self._microphones[name])
             predicted_s = self._away[name][0] / self._c_m_s[:, None, None]
             off_s = centred_where(predicted_s, self._stacked.there[name]) - self._stacked.measured_s[name]
-            residuals[name] = (off_s + late_s * self._of_late[name]) / DELAY_STD_S
+            residuals[name] = (off_s + late_s * self._of_late[name]) / self._stacked.std_s[name][..., None]
         return residuals
 
     def _deviances(self) -> FloatArray:
@@ -204,8 +201,52 @@ class Fit:
             total = total + ((TAILS + self._count[name]) * np.log1p(squares / TAILS)).sum(axis=1)
         return np.asarray(total)
 
-    def _step(self, wider: float) -> None:
-        """Make one step of the method of Gauss and Newton, the places eliminated; reweighted for the tails."""
+    def pose_of(self, name: str) -> IntArray:
+        """Return the indices of an array's shift and turn among the unknowns, (6,)."""
+        begin = self._columns[name].start
+        return np.arange(begin, begin + _POSE)
+
+    def pose_stds(self, name: str) -> FloatArray:
+        """Return the standard deviations of an array's shift (metres) and turn (radians) in the first set-up, (6,)."""
+        return np.asarray(self._scale[0, self.pose_of(name)])
+
+    def seen(self) -> FloatArray:
+        """Return how much of each unknown the delays show beyond what every set-up may be off by, (H, U, U).
+
+        A fault d (U,), in standard deviations, changes the deviance by d' M d on average, M being the matrix of a
+        set-up. It is the identity where the delays show everything, and 0 where they show nothing.
+        """
+        self._places_m, self._unknowns = self._best
+        self._off = self._residuals()
+        normal, mixed, _, whole, _ = self._normal_equations(0.0)
+        reduced = _reduced(inverse(normal) @ mixed, mixed, whole)
+        return np.asarray(np.eye(whole.shape[-1]) - np.linalg.inv(reduced))
+
+    def _step(self, least_std_s: float) -> None:
+        """Make one step of the method of Gauss and Newton, the places eliminated; reweighted for the tails.
+
+        No delay is taken to be more exact than `least_std_s`.
+        """
+        normal, mixed, right, whole, gradient = self._normal_equations(least_std_s)
+        inverted = inverse(normal)
+        of_mixed, of_right = inverted @ mixed, (inverted @ right[..., None])[..., 0]
+        rows, count = gradient.shape
+        eliminated = mixed.reshape(rows, -1, count).swapaxes(1, 2)
+        rest = gradient - (eliminated @ of_right.reshape(rows, -1, 1))[..., 0]
+        change = -np.linalg.solve(_reduced(of_mixed, mixed, whole), rest[..., None])[..., 0]
+        step_m = -(of_right + (of_mixed @ change[:, None, :, None])[..., 0])
+        moved_m = self._places_m + np.clip(step_m, -_MOST_STEP_M, _MOST_STEP_M)
+        self._places_m = np.clip(moved_m, *self._stacked.bounds_m.T)
+        self._unknowns = self._unknowns + change
+
+    def _normal_equations(
+        self, least_std_s: float
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return the normal equations in blocks, with no delay more exact than a standard deviation, seconds.
+
+        They are those of the places (H, S, 3, 3), of places and unknowns (H, S, 3, U), the gradient by the places
+        (H, S, 3), the equations of the unknowns (H, U, U) and the gradient by these (H, U).
+        """
         rows, count = self._scale.shape
         sounds = self._places_m.shape[1]
         normal = np.tile(_LEAST_SLOPE * np.eye(3), (rows, sounds, 1, 1))
@@ -214,6 +255,7 @@ class Fit:
         for name, columns in self._columns.items():
             of_places, of_unknowns = self._slopes(name)
             off = self._off[name]
+            wider = np.maximum(least_std_s / self._stacked.std_s[name], 1.0)
             squares = (off**2).sum(axis=-1) / wider**2
             weight = (TAILS + self._count[name]) / (TAILS + squares) / wider**2
             used = np.r_[columns, count - 2, count - 1]
@@ -225,34 +267,33 @@ class Fit:
             flat = (of_unknowns * root[..., None]).reshape(rows, -1, len(used)).swapaxes(1, 2)
             whole[:, used[:, None], used] += flat @ flat.swapaxes(1, 2)
             gradient[:, used] += (flat @ (off * root).reshape(rows, -1, 1))[..., 0]
-        inverted = inverse(normal)
-        of_mixed, of_right = inverted @ mixed, (inverted @ right[..., None])[..., 0]
-        eliminated = mixed.reshape(rows, -1, count).swapaxes(1, 2)
-        reduced = whole - eliminated @ of_mixed.reshape(rows, -1, count)
-        rest = gradient - (eliminated @ of_right.reshape(rows, -1, 1))[..., 0]
-        change = -np.linalg.solve(reduced, rest[..., None])[..., 0]
-        step_m = -(of_right + (of_mixed @ change[:, None, :, None])[..., 0])
-        moved_m = self._places_m + np.clip(step_m, -_MOST_STEP_M, _MOST_STEP_M)
-        self._places_m = np.clip(moved_m, *self._stacked.bounds_m.T)
-        self._unknowns = self._unknowns + change
+        return normal, mixed, right, whole, gradient
 
     def _slopes(self, name: str) -> tuple[FloatArray, FloatArray]:
         """Slopes of an array's residuals by the places, (H, S, K, 3), and by its unknowns and the last two."""
         away_m, unit = self._away[name]
         at_m, c_m_s = self._microphones[name], self._c_m_s[:, None, None]
         there, scale = self._stacked.there[name], self._scale[:, None, None]
-        of_places = unit / (c_m_s[..., None] * DELAY_STD_S)
+        std_s = self._stacked.std_s[name][..., None]
+        of_places = unit / (c_m_s * std_s)[..., None]
         slope = -of_places  # by the microphones' positions
         turns = np.cross((at_m - at_m.mean(axis=1, keepdims=True))[:, None], slope)
         rows, sounds, channels, _ = slope.shape
         own = np.zeros((rows, sounds, channels, channels, 3))
         index = np.arange(channels)
         own[:, :, index, index] = slope
-        speed = -away_m / (c_m_s**2 * DELAY_STD_S)
+        speed = -away_m / (c_m_s**2 * std_s)
         parts = [slope, turns, own.reshape(rows, sounds, channels, -1), speed[..., None]]
         centred = centred_rows(np.concatenate(parts, axis=-1), there)
-        of_late = self._of_late[name][..., None] / DELAY_STD_S
+        of_late = (self._of_late[name] / std_s)[..., None]
         of_unknowns = np.concatenate([centred, of_late], axis=-1)
         columns = self._columns[name]
         scales = np.concatenate([scale[..., columns], scale[..., -2:]], axis=-1)
         return centred_rows(of_places, there), of_unknowns * scales
+
+
+def _reduced(of_mixed: FloatArray, mixed: FloatArray, whole: FloatArray) -> FloatArray:
+    """Normal equations (H, U, U) of the unknowns alone, the places eliminated."""
+    rows, count = whole.shape[:2]
+    eliminated = mixed.reshape(rows, -1, count).swapaxes(1, 2)
+    return np.asarray(whole - eliminated @ of_mixed.reshape(rows, -1, count))

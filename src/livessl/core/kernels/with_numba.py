@@ -10,11 +10,11 @@ from typing import Final
 import numpy as np
 
 from livessl.core.kernels.arguments import SILENT_POWER
+from livessl.core.kernels.cells_with_numba import cell_intervals as cell_intervals
+from livessl.core.kernels.cells_with_numba import reaches_of_parts as reaches_of_parts
 from livessl.core.kernels.jit import jit
 from livessl.core.kernels.search_with_numba import bounds_of_rest as bounds_of_rest
-from livessl.core.kernels.search_with_numba import cell_intervals as cell_intervals
 from livessl.core.kernels.search_with_numba import highest as highest
-from livessl.core.kernels.search_with_numba import reaches_of_parts as reaches_of_parts
 from livessl.core.kernels.search_with_numba import running_maxima as running_maxima
 from livessl.core.kernels.search_with_numba import upper_bounds as upper_bounds
 

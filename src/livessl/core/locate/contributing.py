@@ -56,7 +56,7 @@ gives 0.3; sounds of the development half that do not stand out, in the paper's 
 incoherent bursts give 1 to 20."""
 
 NO_EVIDENCE: Final = "no direction stands out in the sound"
-"""Why a position is refused if no array contributes."""
+"""Reason for refusing a position if no array contributes."""
 
 _NEAR_FIELD: Final = 2.0
 """Factor on the number of independent places, because the wave fronts of near sources are curved; found by simulated

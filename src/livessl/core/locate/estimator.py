@@ -64,6 +64,8 @@ class Sound:
         Whether the array detected the sound by itself; if not, its frames were requested.
     course : Course or None
         The frames of `onsets`, one for each; None if unknown.
+    second_looks : bool
+        Whether there is time to locate a doubtful sound again by other evidence; not on a server that is overloaded.
     """
 
     segments: Sequence[Float32Array]
@@ -74,6 +76,7 @@ class Sound:
     ended: bool = True
     detected: bool = True
     course: Course | None = None
+    second_looks: bool = True
 
     @property
     def onset_strength(self) -> float:

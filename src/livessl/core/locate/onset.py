@@ -80,7 +80,7 @@ class _Answer:
 
     @property
     def is_sure(self) -> bool:
-        """Whether a second look is not worth its time."""
+        """True if a second look is not worth its time."""
         return self.refused is None and self.judgement.features.is_sure
 
     def rank(self) -> tuple[bool, bool, float]:
@@ -131,15 +131,18 @@ class Onset(MapEstimator):
 
         If there is no second source and the first answer is not sure, a sound that has ended gets a second look: whole
         segments are added to the onsets, and the more confident of the two answers is returned. A sound that a place
-        outside the search volume explains better is reported as such (`livessl.core.locate.outside`).
+        outside the search volume explains better is reported as such (`livessl.core.locate.outside`). Neither whole
+        segments nor clocks that are apart inside an array are considered unless every sound allows `second_looks`.
         """
         strongest = strongest_onsets(sounds, MOST_ARRAYS)
+        looks_again = all(sound.second_looks for sound in strongest.values())
+        looks_at_whole = looks_again and all(sound.ended for sound in strongest.values())
         evidence = self.evidence(strongest)
         suspect = [name for name, sound in strongest.items() if sound.suspect]
-        answer = self._answer(evidence, suspect)
+        answer = self._answer(evidence, suspect, tolerance=looks_again)
         if answer.judgement.features.background >= BACKGROUND:
             beneath = self._without_background(evidence, answer.consensus.place)
-            other = self._answer(beneath, suspect)
+            other = self._answer(beneath, suspect, tolerance=looks_again)
             if other.refused is None and other.rank() > answer.rank():
                 evidence, answer = beneath, other
         answer = self._by_beginning(answer, suspect)
@@ -157,7 +160,7 @@ class Onset(MapEstimator):
             outside = None
             second = self._with_candidates(second)
             others = (replace(second, unneeded=sounds.keys() - {part.spec.name for part in second.evidence}),)
-        elif outside is None and not answer.is_sure and all(sound.ended for sound in strongest.values()):
+        elif outside is None and looks_at_whole and not answer.is_sure:
             second_look = self._answer(self._with_whole_segments(evidence, strongest), suspect, whole=True)
             answer = max(answer, second_look, key=_Answer.rank)
             outside = self._outside(answer)
@@ -184,7 +187,9 @@ class Onset(MapEstimator):
         first = first_frame(sounds)
         return tuple(self._onset_evidence(name, sounds[name], first) for name in sorted(sounds))
 
-    def _answer(self, evidence: tuple[Evidence, ...], suspect: Collection[str], *, whole: bool = False) -> _Answer:
+    def _answer(
+        self, evidence: tuple[Evidence, ...], suspect: Collection[str], *, whole: bool = False, tolerance: bool = True
+    ) -> _Answer:
         """Answer by sharp evidence, unless another place is more certain when clocks inside the arrays may be apart.
 
         Arrays that disagree do so for another reason, and wide peaks would hide it. Where the arrays do not determine
@@ -192,7 +197,7 @@ class Onset(MapEstimator):
         """
         sharp = self._answer_by(evidence, suspect, whole=whole)
         is_agreed = sharp.refused is None and not sharp.consensus.outliers
-        if not is_agreed or sharp.judgement.features.crossing_deg < CROSSING_DEG:
+        if not tolerance or not is_agreed or sharp.judgement.features.crossing_deg < CROSSING_DEG:
             return sharp
         place = sharp.consensus.place
         (peak,) = self._search.among([tolerant(part) for part in sharp.evidence])(1)

@@ -275,7 +275,7 @@ class SecondSourceSearch:
         return Place(evidence, functional, position_m, power, refine.rival_power(find, self._grid, position_m))
 
     def _clearest(self, place: Place, remainders: Sequence[Remainder]) -> Place:
-        """Of the candidates with the highest power, return the one with the highest product of power and prominence."""
+        """Return the candidate with the highest product of power and prominence, among those with the highest power."""
         evidence = tuple(each.evidence() for each in remainders)
         find, functional = self._search.among(evidence), SRPFunctional(evidence, self._c_m_s)
         known = [refine.neighbourhood(place.position_m, self._grid)]

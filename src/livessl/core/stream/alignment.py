@@ -1,4 +1,4 @@
-"""Aligns the frames of all arrays on one frame index, and decides what to do with late frames. It reads no clock.
+"""Aligns the frames of all arrays on one frame index, and decides which are late for early results. It reads no clock.
 
 A frame index closes when every array that is awaited has reached it, or at its deadline. A frame that comes later is
 counted as late. Early results that were already computed do not include it; the final pass (`final_pass`) does. An
@@ -21,7 +21,8 @@ EARLIEST_NS: Final = -30_000_000_000
 """Limit, in nanoseconds, of a frame's time minus the server's: below it, 30 s in the past, a frame is backlog."""
 
 LATEST_NS: Final = 500_000_000
-"""Limit, in nanoseconds, of a frame's time minus the server's: above it a frame is rejected. NTP is better."""
+"""Limit, in nanoseconds, of a frame's time minus the server's: above it a frame is rejected. Clocks set by NTP
+differ by less."""
 
 JUMP_FRAMES: Final = 1200
 """Gap, in frames, beyond which the frame indices in between are skipped and not closed one by one: a minute."""

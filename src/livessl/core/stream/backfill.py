@@ -1,8 +1,8 @@
 """Backfill: requests frames of an event from arrays that did not detect it, and decides whether to use them.
 
-If the detecting arrays' result is unsure, the frames that other nodes would have sent are requested. They are used only
-if they improve the result. Evidence is not normalised, so that an array that
-received none of the sound adds next to nothing.
+If the result of the arrays that detected the sound is unsure, frames are requested from the others. They are used only
+if they improve the result. Evidence is not normalised, so an array that received none of the sound hardly changes the
+result.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ MOST_REQUESTED_S: Final = 3.0
 the rest of a longer one."""
 
 SHARE: Final = 0.25
-"""Long-run limit on requested frames, as a share of elapsed time, after an initial `RECENT_S`."""
+"""Most of an array's sound, as a share, that is requested in the long run; at the start `RECENT_S` of it may be."""
 
 _RANK: Final = {Status.REFUSED: 0, Status.DIRECTION_ONLY: 1, Status.LOCATED: 2}
 
@@ -101,7 +101,7 @@ class Backfill:
         attempts = [useful, *({name: useful[name]} for name in useful if len(useful) > 1)] if useful else []
         for backfilled in attempts:
             verdict = self._verdicts.locate_event(event, excerpt, now_ns, backfilled)
-            if is_better(verdict.events[0], best[0]):
+            if is_as_good(verdict.events[0], best[0]):
                 best = verdict.events
                 self._verdicts.count_votes(event, excerpt, verdict)
         return best
@@ -140,8 +140,8 @@ def nearest(silent: Sequence[ArraySpec], detecting: Sequence[ArraySpec]) -> list
 def backfilled_sound(requested: RequestedFrames, estimator: Estimator, start: int) -> BackfilledSound | None:
     """Correlate the requested frames of an event that began at frame index `start`.
 
-    Use only the last consecutive frames. Return None if none belongs to the event itself, if their sampling rates
-    differ, or if the estimator does not correlate frames.
+    Only the unbroken run of frames at the end is used. Return None if all of it is older than the event, if
+    sampling rates differ, or if the estimator does not correlate frames.
     """
     indices = list(takewhile(lambda frame_index: frame_index in requested.frames, reversed(requested.span)))[::-1]
     frames = [requested.frames[frame_index] for frame_index in indices]
@@ -166,8 +166,8 @@ def is_sure(event: Event) -> bool:
     )
 
 
-def is_better(event: Event, than: Event) -> bool:
-    """Return whether an event is worth as much as another result of the same sound, or more."""
+def is_as_good(event: Event, than: Event) -> bool:
+    """Return whether an event is at least as good as another result of the same sound."""
     return _worth(event) >= _worth(than)
 
 

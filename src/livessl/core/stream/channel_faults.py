@@ -76,7 +76,7 @@ Pair = tuple[int, int]
 
 @dataclass(slots=True)
 class _Likeness:
-    """How long two channels, or the channels of two arrays, have been the same."""
+    """Counts of the time for which two channels, or the channels of two arrays, have been the same."""
 
     quiet_frames: int = 0
     active_frames: int = 0

@@ -209,7 +209,8 @@ class EvidenceCollector:
         Those of suspect arrays, and of arrays with faulty channels, are left out.
         """
         window = range(last - self._parameters.window_frames + 1, last + 1)
-        sounds = Sounds(self._parameters.live_sources, ended=False)
+        second_looks = self._state.relief.second_looks
+        sounds = Sounds(self._parameters.live_sources, ended=False, second_looks=second_looks)
         excerpt = Excerpt(sounds, window.start * FRAME_NS, window.stop * FRAME_NS)
         for name, stream in self._alignment.streams.items():
             segments, there = stream.segments([k for k in window if stream.has_active(k)])
@@ -227,7 +228,8 @@ class EvidenceCollector:
 
     def event(self, span: range) -> Excerpt:
         """Return the active frames, by the exact rule, of an event that spans these frame indices with its pre-roll."""
-        excerpt = Excerpt(Sounds(self._parameters.sources, self._votes.suspects()))
+        second_looks = self._state.relief.second_looks
+        excerpt = Excerpt(Sounds(self._parameters.sources, self._votes.suspects(), second_looks=second_looks))
         for stream in self._alignment.streams.values():
             self._add(excerpt, stream, span)
         return excerpt

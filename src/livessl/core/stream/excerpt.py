@@ -48,12 +48,17 @@ class Sounds(Mapping[str, Sound]):
         Names of the suspect arrays.
     ended : bool
         Whether the sound has ended, so that each array's sound is complete.
+    second_looks : bool
+        Whether there is time to locate a doubtful sound again.
     """
 
-    def __init__(self, sources: int, suspects: Collection[str] = (), *, ended: bool = True) -> None:
+    def __init__(
+        self, sources: int, suspects: Collection[str] = (), *, ended: bool = True, second_looks: bool = True
+    ) -> None:
         self.sources = sources
         self.suspects = suspects
         self.ended = ended
+        self.second_looks = second_looks
         self._segments: dict[str, Sequence[Sequence[Frame]]] = {}
         self._onsets: dict[str, tuple[OnsetGCC, ...]] = {}
         self._courses: dict[str, Course] = {}
@@ -78,7 +83,7 @@ class Sounds(Mapping[str, Sound]):
 
     def copy(self) -> Sounds:
         """Return a copy that sounds can be added to."""
-        copy = Sounds(self.sources, self.suspects, ended=self.ended)
+        copy = Sounds(self.sources, self.suspects, ended=self.ended, second_looks=self.second_looks)
         copy._segments |= self._segments
         copy._onsets |= self._onsets
         copy._courses |= self._courses
@@ -110,6 +115,7 @@ class Sounds(Mapping[str, Sound]):
             self.ended,
             array not in self._requested,
             self._courses[array],
+            self.second_looks,
         )
 
     def __iter__(self) -> Iterator[str]:

@@ -47,7 +47,7 @@ class HeldFrames:
 
     @property
     def first(self) -> int | None:
-        """The first frame index of which a frame is held; None if none is held."""
+        """First frame index of which a frame is held; None if none is held."""
         return self._waiting[0][0] if self._waiting else None
 
     def push(self, frame: Frame, frame_index: int, now_ns: int) -> None:

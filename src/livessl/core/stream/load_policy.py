@@ -38,14 +38,14 @@ HOLD_NS: Final = 3_000_000_000
 twice as long the next time."""
 
 RELAPSE_NS: Final = 15_000_000_000
-"""Time, in nanoseconds, within which a level was needed again if more is shed."""
+"""Time, in nanoseconds: if more has to be shed again within it, less was shed too soon."""
 
 LONGEST_HOLD_NS: Final = 40_000_000_000
 """Longest hold, in nanoseconds."""
 
 PROMPT_S: Final = 0.25
-"""Delay, in seconds, beyond which a level that sheds updates leaves them all out: half of the time that live results
-may take. The other half is needed to locate and to deliver."""
+"""Delay, in seconds, beyond which a level that sheds updates leaves them all out, and second looks as well: half of the
+time that live results may take. The other half is needed to locate and to deliver."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +56,8 @@ class Relief:
     ----------
     update_every : int or None
         One of so many updates is located; None locates none.
+    second_looks : bool
+        Whether the estimator may take further looks at a doubtful sound.
     maps : bool
         Whether power maps are drawn.
     arrays : int or None
@@ -66,6 +68,7 @@ class Relief:
     """
 
     update_every: int | None = 1
+    second_looks: bool = True
     maps: bool = True
     arrays: int | None = None
     ahead: bool = True
@@ -75,6 +78,7 @@ class Relief:
         """The work that is shed, by the names that the API uses."""
         which = {
             "updates": self.update_every != 1,
+            "second_looks": not self.second_looks,
             "maps": not self.maps,
             "arrays": self.arrays is not None,
             "quiet": not self.ahead,
@@ -87,17 +91,17 @@ NOTHING_SHED: Final = Relief()
 LEVELS: Final = (
     NOTHING_SHED,
     Relief(update_every=2),
-    Relief(update_every=5),
-    Relief(update_every=5, maps=False),
-    Relief(update_every=5, maps=False, arrays=32),
-    Relief(update_every=5, maps=False, arrays=16),
-    Relief(update_every=10, maps=False, arrays=8),
-    Relief(update_every=10, maps=False, arrays=4),
-    Relief(update_every=10, maps=False, arrays=4, ahead=False),
-    Relief(update_every=None, maps=False, arrays=3, ahead=False),
+    Relief(update_every=5, second_looks=False),
+    Relief(update_every=5, second_looks=False, maps=False),
+    Relief(update_every=5, second_looks=False, maps=False, arrays=32),
+    Relief(update_every=5, second_looks=False, maps=False, arrays=16),
+    Relief(update_every=10, second_looks=False, maps=False, arrays=8),
+    Relief(update_every=10, second_looks=False, maps=False, arrays=4),
+    Relief(update_every=10, second_looks=False, maps=False, arrays=4, ahead=False),
+    Relief(update_every=None, second_looks=False, maps=False, arrays=3, ahead=False),
 )
-"""The work that is shed at each level: updates first, then maps, then arrays of little evidence, then frames of quiet.
-With the defaults an update every 0.1 s becomes one every 0.2, 0.5 and 1 s."""
+"""The work that is shed at each level: updates first, then second looks at doubtful sounds, then maps, then arrays of
+little evidence, then frames of quiet. With the defaults an update every 0.1 s becomes one every 0.2, 0.5 and 1 s."""
 
 
 class LoadPolicy:

@@ -46,7 +46,7 @@ class ArraySetUp:
 
 @dataclass(slots=True)
 class _Conditions:
-    """What changes while a site runs, and all passes share."""
+    """Conditions that change while a site runs, and that all passes share."""
 
     answering: set[str] = field(default_factory=set)
     excluded: Collection[str] = ()
@@ -108,7 +108,7 @@ class SiteState:
 
     @property
     def estimator(self) -> Estimator:
-        """What locates."""
+        """The estimator in use."""
         return self._set_up.estimator
 
     @property

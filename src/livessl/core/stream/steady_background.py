@@ -1,4 +1,4 @@
-"""The level of what changes: the power of a frame in the band, without hum and rumble. It reads no clock.
+"""Measures the power of a frame in the band without steady noise such as hum and rumble. It reads no clock.
 
 A mains hum, a fan's tone or rumble can be far above everything else in the band, so that a sound which is 30 dB above
 all the rest hardly raises the level. The background is therefore tracked in every bin of the frames' spectra, as the

@@ -212,7 +212,7 @@ class GCC:
 
 @dataclass(frozen=True, slots=True)
 class Uncertainty:
-    """How exactly an array's set-up is known, as standard deviations.
+    """Accuracy to which an array's set-up is known, as standard deviations.
 
     Parameters
     ----------

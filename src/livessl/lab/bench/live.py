@@ -29,14 +29,14 @@ READY_NS: Final = 120_000_000_000
 """Longest time, in nanoseconds, until a server has computed its tables and receives every array."""
 
 SETTLE_NS: Final = 8_000_000_000
-"""Time, in nanoseconds, from then on, in which the server works off the backlog of its start."""
+"""Time, in nanoseconds, that a ready server gets to work off the backlog of its start."""
 
 SAMPLE_NS: Final = 1_000_000_000
 """Time, in nanoseconds, between two readings of processor time and memory."""
 
 PERCENTILES: Final = (50, 95, 99, 100)
 LOST: Final = ("late", "rejected", "lost_frames", "sequence_gaps")
-"""Counters of an array for frames that no result used."""
+"""An array's counters of frames that were late or lost."""
 
 Serve = Callable[[Path], Any]
 """Starts a server with a site file, as a process."""
@@ -85,13 +85,13 @@ class Outcome:
     lost : dict of str to int
         In the measured time: the server's counters of frames without use, and messages that clients missed.
     updates_due, updates : int, float
-        Windows of sound in the measured time, and the mean number of updates that a client received for them.
+        Updates that were due in the measured time, and how many a client received on average.
     events : float
         Mean number of events that a client received, from the warm-up on.
     latency_ms : dict of str to float
         Time from the end of a window to a client, percentiles over all updates and clients.
     stages_ms : dict of str to dict of str to float
-        Percentiles of each stage, and `load`: the delay of the load itself, which is part of `sent`.
+        Percentiles of each stage, and of `load`: how late the load itself was; the stage `sent` includes it.
     pictures : int
         Number of maps that all watchers received.
     cpu_percent : float
@@ -99,8 +99,8 @@ class Outcome:
     rss_mb : tuple of float
         Resident memory of the server at the beginning of the measured time, at its end, and at most, in megabytes.
     shed : dict of str to int
-        What the server gave up for the load in the measured time: `updates`, and the sound of `frames`; and the level
-        of shedding at its end.
+        What the server shed in the measured time: `updates`, and `frames` whose sound was not used; and `level`, that
+        of shedding at the end.
     """
 
     demand: Demand

@@ -1,4 +1,5 @@
 """Campaigns of simulated rooms: the paper's experiments and the localizer's own, with results, claims and figures.
 
-They call the pipeline as users do; no parameter of the pipeline is set here.
+`paper` has the paper's experiments as data and `localizer` those of this project; `campaign` runs either. They call the
+pipeline as users do; no parameter of the pipeline is set here.
 """

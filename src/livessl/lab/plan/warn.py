@@ -17,7 +17,7 @@ IN_LINE_M: Final = 0.3
 """Arrays count as collinear if their RMS distance from the best-fitting line is at most this, in metres."""
 
 MAX_ALIASED_SHARE: Final = 0.5
-"""If more than this share of (point, pair) combinations alias inside the band, the grid is reported as too coarse."""
+"""Share of (point, pair) combinations that alias inside the band, above which the grid is reported as too coarse."""
 
 MAX_EDGE_PER_RATE: Final = 0.45
 """Highest band edge, as a share of the sample rate, at which correlations are interpolated accurately."""

@@ -43,6 +43,8 @@ class Courier:
     clock : Clock
     traces : EventTraces or None
         Adds a span for each attempt; None if nothing is traced.
+    complete : callable or None
+        Returns an alert with what each attempt adds to it, such as links; None adds nothing.
     """
 
     def __init__(
@@ -53,8 +55,10 @@ class Courier:
         outbox: Outbox,
         clock: Clock,
         traces: EventTraces | None = None,
+        complete: Callable[[JsonObject], JsonObject] | None = None,
     ) -> None:
         self.name = name
+        self._complete = complete
         self._traces = traces
         self._config = config
         self._action = action
@@ -132,7 +136,7 @@ class Courier:
     async def _attempted(self, alert: JsonObject) -> None:
         """Deliver an alert; an unexpected fault of the action is a failed attempt like any other."""
         try:
-            await self._action.deliver(alert)
+            await self._action.deliver(alert if self._complete is None else self._complete(alert))
         except DeliveryError:
             raise
         except Exception as error:

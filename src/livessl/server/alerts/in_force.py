@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from livessl.clock import Clock
@@ -13,9 +14,10 @@ from livessl.server.alerts.courier import Courier
 from livessl.server.alerts.evidence import Evidence
 from livessl.server.alerts.history import DryRuns
 from livessl.server.alerts.judge import Judge
-from livessl.server.alerts.message import AlertMessages
+from livessl.server.alerts.message import AlertMessages, with_links
 from livessl.server.alerts.outbox import Outbox
 from livessl.server.event_traces import EventTraces
+from livessl.server.signed_links import SignedLinks
 from livessl.server.store import Store
 from livessl.server.zones.shapes import ZoneMap
 from livessl.site.alert_checks import outbox_file
@@ -27,7 +29,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Surroundings:
-    """What rules and actions need beside the site file.
+    """Parts of the server that rules and actions need beside the site file.
 
     Parameters
     ----------
@@ -41,6 +43,8 @@ class Surroundings:
         Pictures and clips of alerts.
     traces : EventTraces or None
         Adds spans of alerts; None if nothing is traced.
+    links : SignedLinks or None
+        Signs links for people without a token; None if nobody needs one.
     """
 
     clock: Clock
@@ -49,6 +53,7 @@ class Surroundings:
     url: str
     evidence: Evidence
     traces: EventTraces | None = None
+    links: SignedLinks | None = None
 
 
 class AlertsInForce:
@@ -71,6 +76,8 @@ class AlertsInForce:
     def __init__(self, site: Site, outbox: Outbox, around: Surroundings) -> None:
         self.config: AlertsConfig = site.alerts
         """Rules and actions as the site file has them."""
+        self.outbox = outbox
+        """Alerts, deliveries and the rules' states."""
         kinds = {rule.kind for rule in self.config.rules.values()}
         self.judges_events = "events" in kinds
         self.judges_early = any(rule.events and rule.events.early for rule in self.config.rules.values())
@@ -102,4 +109,6 @@ def _courier(name: str, site: Site, around: Surroundings, outbox: Outbox, url: s
     taken = {rule for rule, each in alerts.rules.items() if not alike.isdisjoint(each.actions)}
     others = sorted((alerts.rules.keys() | outbox.states().keys()) - taken)
     action = make_action(ActionSetting(name, config, site, around.clock, rules, others, url, around.evidence))
-    return Courier(name, config, action, outbox, around.clock, around.traces)
+    links = around.links
+    complete = None if links is None else partial(with_links, links=links, config=alerts.links, url=url)
+    return Courier(name, config, action, outbox, around.clock, around.traces, complete)

@@ -10,8 +10,11 @@ from typing import Any, Final
 
 from livessl.clock import utc_text
 from livessl.core.commission.finding import Finding
+from livessl.core.types import Status
 from livessl.server.alerts.rules import Match
 from livessl.server.api.encode import JsonObject
+from livessl.server.signed_links import SignedLinks
+from livessl.site.alert_models import LinksConfig
 from livessl.site.models import Site
 
 KEY_PREFIX: Final = "alert_"
@@ -124,14 +127,46 @@ class AlertMessages:
         }
 
 
+def with_links(alert: JsonObject, links: SignedLinks, config: LinksConfig, url: str) -> JsonObject:
+    """Return an alert with links that open its picture and its recording without a token until they expire.
+
+    They are signed when it is delivered, and stored nowhere: not everyone who may read alerts by the API may listen.
+
+    Parameters
+    ----------
+    alert : JsonObject
+    links : SignedLinks
+    config : LinksConfig
+    url : str
+        Address of the server for people, without a slash at its end.
+    """
+    event = alert["event"]
+    paths: dict[str, str] = {}
+    if "picture" in config.of and alert.get("picture") is not None:
+        paths["picture"] = f"/api/v1/alerts/{alert['key']}/picture.png"
+    if "clip" in config.of and alert.get("clips") is not None and event["status"] == Status.LOCATED:
+        paths["clip"] = f"/api/v1/events/{event['id']}/clips/best"
+    signed = {name: links.sign(path, config.lifetime_s) for name, path in paths.items()}
+    if not signed:
+        return {**alert, "links": None}
+    addresses = {name: url + signed[name][0] if name in signed else None for name in ("picture", "clip")}
+    until_ns = min(expires_ns for _, expires_ns in signed.values())
+    return {**alert, "links": {**addresses, "until_utc": utc_text(until_ns)}}
+
+
 def title(alert: JsonObject) -> str:
     """Return a short heading for mails and chats."""
     return f"livessl {alert['site']}: {alert['rule']}"
 
 
 def body(alert: JsonObject) -> str:
-    """Return the text of a mail or chat message: what, when, the link, and the key that repeated messages share."""
-    return f"{alert['text']}\n{alert['time_utc'] or 'at an unknown time'}\n{alert['link']}\n{alert['key']}"
+    """Return the text of a mail or chat message: what, when, the links, and the key that repeated messages share."""
+    lines = [alert["text"], alert["time_utc"] or "at an unknown time", alert["link"]]
+    links = alert.get("links")
+    if links is not None:
+        lines += [f"{name}: {links[name]}" for name in ("picture", "clip") if links[name] is not None]
+        lines.append(f"whoever has these links can open them until {links['until_utc']}")
+    return "\n".join((*lines, alert["key"]))
 
 
 def _event_text(event: JsonObject, zones: Mapping[str, float], count: int) -> str:

@@ -34,7 +34,7 @@ UNKNOWN_IN_JOURNAL: Final = 100
 """Newest alerts that the journal may lack, in a file of a release that did not note what the journal has."""
 
 NO_ACTION: Final = "the site file no longer has this action"
-"""Why an alert was given up whose action was removed."""
+"""Reason for giving up an alert whose action was removed."""
 
 CURE: Final = "free space on its disk, or close the program that locks the file"
 

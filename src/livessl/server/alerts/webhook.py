@@ -1,4 +1,4 @@
-"""Webhooks: alerts as HTTP requests that are signed as the Standard Webhooks specification describes."""
+"""Webhooks: alerts as HTTP requests, signed as the Standard Webhooks specification says. `courier` tries again."""
 
 from __future__ import annotations
 

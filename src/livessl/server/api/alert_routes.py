@@ -13,7 +13,7 @@ from fastapi import APIRouter, HTTPException, Path, Query, Request, Response
 from livessl.clock import utc_text
 from livessl.schema import alerts as alert_schema
 from livessl.schema.answers import errors
-from livessl.server.alerts.history import DryRunBusyError
+from livessl.server.alerts.history import DryRun, DryRunBusyError
 from livessl.server.alerts.outbox import Delivery, DeliveryState, OutboxError
 from livessl.server.alerts.picture import DEFAULT_PX, MAX_PX
 from livessl.server.alerts.rules import SUPPRESSED, RuleState
@@ -38,7 +38,7 @@ _log = logging.getLogger(__name__)
 
 
 def alert_routes(parts: Parts) -> APIRouter:
-    """Rules and alerts."""
+    """Alerts with their pictures, and the rules."""
     alerts, router = parts.alerts, APIRouter(prefix="/api/v1/alerts", tags=["alerts"])
     drawing = threading.Lock()  # one picture at a time, for the memory and the processor
 
@@ -85,6 +85,14 @@ def alert_routes(parts: Parts) -> APIRouter:
             raise HTTPException(404, f"no alert {key!r} about a place; GET alerts lists them")
         return Response(picture, media_type="image/png", headers={"Cache-Control": "private, max-age=60"})
 
+    _add_rule_routes(router, parts)
+    return router
+
+
+def _add_rule_routes(router: APIRouter, parts: Parts) -> None:
+    """Add the routes of rules: their states, their switches, and the dry run."""
+    alerts = parts.alerts
+
     @router.get("/rules", response_model=alert_schema.Rules)
     def get_rules() -> Response:
         """The site's rules and their states."""
@@ -126,24 +134,7 @@ def alert_routes(parts: Parts) -> APIRouter:
         except DryRunBusyError as error:
             headers = {"Retry-After": str(DRY_RUN_RETRY_S)}
             raise HTTPException(503, "another dry run is under way; try again when it has ended", headers) from error
-        times = "once" if tried.alerts == 1 else f"{tried.alerts} times"
-        span = "day" if days == 1 else f"{days:g} days"
-        found = {
-            "v": API_VERSION,
-            "name": name,
-            "since_utc": utc_text(since_ns),
-            "until_utc": utc_text(now_ns),
-            "events": tried.events,
-            "matched": tried.matched,
-            "alerts": tried.alerts,
-            "suppressed": _suppressed(tried.suppressed),
-            "latest": [{"event_id": event["id"], "time_utc": event["time_utc"]} for event in tried.latest],
-            "complete": tried.complete,
-            "text": f"rule {name!r} would have alerted {times} in the last {span}",
-        }
-        return as_json(found)
-
-    return router
+        return as_json({"v": API_VERSION, "name": name, **_tried(name, tried, days, since_ns, now_ns)})
 
 
 def dead_letter_routes(parts: Parts) -> APIRouter:
@@ -250,6 +241,22 @@ def _rule(config: AlertsConfig, name: str, state: RuleState, now_ns: int) -> Jso
         "last_utc": None if state.last_ns is None else utc_text(state.last_ns),
         "suppressed": _suppressed(state.suppressed),
         "ongoing": list(state.ongoing),
+    }
+
+
+def _tried(name: str, tried: DryRun, days: float, since_ns: int, until_ns: int) -> JsonObject:
+    times = "once" if tried.alerts == 1 else f"{tried.alerts} times"
+    span = "day" if days == 1 else f"{days:g} days"
+    return {
+        "since_utc": utc_text(since_ns),
+        "until_utc": utc_text(until_ns),
+        "events": tried.events,
+        "matched": tried.matched,
+        "alerts": tried.alerts,
+        "suppressed": _suppressed(tried.suppressed),
+        "latest": [{"event_id": event["id"], "time_utc": event["time_utc"]} for event in tried.latest],
+        "complete": tried.complete,
+        "text": f"rule {name!r} would have alerted {times} in the last {span}",
     }
 
 

@@ -23,13 +23,16 @@ from livessl.server.api.headers import SafeHeaders, other_origins
 from livessl.server.api.history_routes import history_routes
 from livessl.server.api.hosts import HostCheck, ServerNames
 from livessl.server.api.journal_routes import journal_routes
+from livessl.server.api.link_routes import link_routes
 from livessl.server.api.live import live_routes
 from livessl.server.api.log_route import log_route
 from livessl.server.api.metrics import metrics_route
+from livessl.server.api.point_routes import point_route
 from livessl.server.api.proposal_routes import proposal_routes
 from livessl.server.api.proxy import BehindProxy
 from livessl.server.api.queries import refuse_unknown_parameters
 from livessl.server.api.reload_routes import reload_route
+from livessl.server.api.relocate_routes import relocate_route
 from livessl.server.api.set_up_routes import set_up_routes
 from livessl.server.api.stream import stream_route
 from livessl.server.api.zone_routes import zone_routes
@@ -85,6 +88,9 @@ def create_app(parts: Parts, access: Access) -> FastAPI:
         set_up_routes(parts),
         proposal_routes(parts),
         clip_routes(parts),
+        relocate_route(parts),
+        link_routes(access),
+        point_route(parts),
         reload_route(parts),
         log_route(parts),
     ):

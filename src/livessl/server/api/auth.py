@@ -10,12 +10,13 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Final
 
-from starlette.datastructures import Headers
+from starlette.datastructures import Headers, QueryParams
 from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from livessl.errors import ConfigError
 from livessl.server.refusals import Refusals
+from livessl.server.signed_links import PARAMETERS, SignedLinks, Verdict, is_linkable
 from livessl.site.tokens import Client, Role, Tokens, file_stamp, read_tokens
 
 DOOR: Final = "http"
@@ -33,6 +34,9 @@ LOG: Final = "/api/v1/log"
 
 ANYONE: Final = Client("anyone", Role.ADMIN)
 """Every client of a site without tokens, whose server listens on the local machine only."""
+
+BEARER: Final = Client("a signed link", Role.OPERATOR)
+"""Whoever opens a signed link, for the one path that it is valid for."""
 
 RELOAD_S: Final = 1.0
 """Interval, in seconds, at which the tokens file is checked for changes: they take effect without a restart."""
@@ -58,6 +62,8 @@ class Access:
     ----------
     tokens_file : Path or None
         None gives every client the role of an admin.
+    links : SignedLinks or None
+        Checks links that open something without a token; None admits none.
 
     Raises
     ------
@@ -65,7 +71,9 @@ class Access:
         If the file cannot be used.
     """
 
-    def __init__(self, tokens_file: Path | None) -> None:
+    def __init__(self, tokens_file: Path | None, links: SignedLinks | None = None) -> None:
+        self.links = links
+        """Checks links that open something without a token; None admits none."""
         self._file = tokens_file
         self._stamp = None if tokens_file is None else file_stamp(tokens_file)
         self._tokens = None if tokens_file is None else read_tokens(tokens_file)
@@ -149,7 +157,11 @@ class Gate:
             return
         token = _token(scope)
         client = self._access.client(token)
+        scope, link = _without_link(scope)
         refusal = _refusal(scope, client)
+        if refusal is not None and link is not None and refusal[0] in (401, 403):
+            refusal = _refusal_of_link(self._access.links, *link) or _refusal(scope, BEARER)
+            client, token = BEARER, None
         if refusal is not None:
             status, reason = refusal
             self._refusals.note(DOOR, caller(scope), reason)
@@ -215,7 +227,7 @@ def needed_role(method: str, path: str) -> Role | None:
 
 def _refusal(scope: Scope, client: Client | None) -> tuple[int, str] | None:
     """Status and reason of a refusal, or None. The text repeats nothing of the request: it is a label of a metric."""
-    needed = needed_role(scope.get("method", "GET"), scope["path"].removeprefix(scope.get("root_path", "")))
+    needed = needed_role(scope.get("method", "GET"), _path(scope))
     if needed is not None and client is None:
         return 401, "expected a valid token; send it as Authorization: Bearer TOKEN"
     if needed is not None and client is not None and client.role < needed:
@@ -226,6 +238,40 @@ def _refusal(scope: Scope, client: Client | None) -> tuple[int, str] | None:
     if int(headers.get("content-length", "0")) > MAX_BODY_BYTES:
         return 413, f"expected a body of at most {MAX_BODY_BYTES} bytes"
     return None
+
+
+def _without_link(scope: Scope) -> tuple[Scope, tuple[str, str, str] | None]:
+    """Return a request without the parameters that sign its address, and path, expiry and signature of the link.
+
+    These are None if the address is not signed, or is one that no link opens.
+    """
+    path = _path(scope)
+    if scope["type"] != "http" or scope["method"] not in ("GET", "HEAD") or not is_linkable(path):
+        return scope, None
+    query: bytes = scope["query_string"]
+    given = QueryParams(query)
+    if PARAMETERS[1] not in given:
+        return scope, None
+    names = tuple(f"{name}=".encode() for name in PARAMETERS)
+    left = b"&".join(part for part in query.split(b"&") if not part.startswith(names))
+    expires, signature = (given.get(name, "") for name in PARAMETERS)
+    return {**scope, "query_string": left}, (path, expires, signature)
+
+
+def _refusal_of_link(links: SignedLinks | None, path: str, expires: str, signature: str) -> tuple[int, str] | None:
+    """Status and reason of the refusal of a link; None if it is valid."""
+    verdict = Verdict.INVALID if links is None else links.check(path, expires, signature)
+    if verdict is Verdict.EXPIRED:
+        return 401, "expected a link that is still valid, got one that has expired; sign in instead"
+    if verdict is Verdict.INVALID:
+        return 401, "expected a link as the server signed it; it was changed, or links were ended; sign in instead"
+    return None
+
+
+def _path(scope: Scope) -> str:
+    """Return the path of a request, without the site's `root_path`."""
+    path: str = scope["path"]
+    return path.removeprefix(scope.get("root_path", ""))
 
 
 def _token(scope: Scope) -> str | None:

@@ -17,7 +17,8 @@ from livessl.schema.answers import errors
 from livessl.server.api import clip_schema
 from livessl.server.api.encode import API_VERSION
 from livessl.server.api.routes import as_json
-from livessl.server.clips.service import state_of
+from livessl.server.clips.relocate import is_relocatable, known_methods
+from livessl.server.clips.service import Clips, state_of
 from livessl.server.parts import Parts
 
 MEDIA_TYPES: Final = {".flac": "audio/flac", ".wav": "audio/wav"}
@@ -33,6 +34,7 @@ _log = logging.getLogger(__name__)
 def clip_routes(parts: Parts) -> APIRouter:
     """Figures, lists, recordings, and what operators may do with them."""
     clips, router = parts.clips, APIRouter(prefix="/api/v1", tags=["clips"])
+    _add_recordings(router, clips)
 
     @router.get("/clips", response_model=clip_schema.ClipsState)
     def get_clips() -> Response:
@@ -56,35 +58,9 @@ def clip_routes(parts: Parts) -> APIRouter:
             "keep": about is not None and about["keep"],
             "position_m": None if about is None else about["position_m"],
             "files": [] if about is None else about["files"],
+            "methods": list(known_methods(parts.site)) if about is not None and is_relocatable(about) else [],
         }
         return as_json(found)
-
-    @router.get(
-        "/events/{event_id}/clips/{name}",
-        response_class=Response,
-        responses={
-            200: {"description": "The recording.", "content": dict.fromkeys(MEDIA_TYPES.values(), _BINARY)},
-            206: {"description": "The part that `Range` asks for.", "content": {"audio/flac": _BINARY}},
-            400: {"description": "`Range` is malformed.", "content": _TEXT},
-            416: {"description": "`Range` lies beyond the end.", "content": _TEXT},
-            **errors(404, texts={404: _NO_FILE}),
-        },
-    )
-    def get_clip(
-        event_id: str,
-        name: str,
-        format: Annotated[  # noqa: A002 - the API's word
-            Literal["stored", "wav"], Query(description="as it is stored, or decoded to 24-bit WAV, always whole")
-        ] = "stored",
-    ) -> Response:
-        """A recording, for operators. `Range` gives parts of it as it is stored."""
-        path = None if clips is None else clips.folder.file(event_id, name)
-        if path is None:
-            raise HTTPException(404, f"event {event_id!r} has no recording {name!r}; GET events/ID/clips lists them")
-        if format == "wav" and path.suffix != ".wav":
-            return Response(_as_wav(path), media_type=MEDIA_TYPES[".wav"])
-        headers = {"Cache-Control": "private, no-cache"}
-        return FileResponse(path, media_type=MEDIA_TYPES[path.suffix], headers=headers)
 
     @router.put(
         "/events/{event_id}/clips/keep",
@@ -114,6 +90,65 @@ def clip_routes(parts: Parts) -> APIRouter:
         return as_json({"v": API_VERSION, "event_id": event_id})
 
     return router
+
+
+def _add_recordings(router: APIRouter, clips: Clips | None) -> None:
+    """Add the routes of the sound itself."""
+
+    @router.get(
+        "/events/{event_id}/clips/best",
+        response_class=Response,
+        responses={
+            200: {"description": "The recording.", "content": dict.fromkeys(MEDIA_TYPES.values(), _BINARY)},
+            206: {"description": "The part that `Range` asks for.", "content": {"audio/flac": _BINARY}},
+            400: {"description": "`Range` is malformed.", "content": _TEXT},
+            416: {"description": "`Range` lies beyond the end.", "content": _TEXT},
+            **errors(404, texts={404: "The event has no recordings, or none yet."}),
+        },
+    )
+    def get_best_clip(event_id: str) -> Response:
+        """The recording that people listen to first, the enhanced one if there is one; for operators."""
+        path = None if clips is None else clips.best_file(event_id)
+        if path is None:
+            if clips is not None and clips.is_waiting(event_id):
+                raise HTTPException(404, f"the recordings of event {event_id!r} are being made; try again in seconds")
+            raise _no_clip(event_id)
+        return _sound_file(path, f"{event_id}-{path.name}")
+
+    @router.get(
+        "/events/{event_id}/clips/{name}",
+        response_class=Response,
+        responses={
+            200: {"description": "The recording.", "content": dict.fromkeys(MEDIA_TYPES.values(), _BINARY)},
+            206: {"description": "The part that `Range` asks for.", "content": {"audio/flac": _BINARY}},
+            400: {"description": "`Range` is malformed.", "content": _TEXT},
+            416: {"description": "`Range` lies beyond the end.", "content": _TEXT},
+            **errors(404, texts={404: _NO_FILE}),
+        },
+    )
+    def get_clip(
+        event_id: str,
+        name: str,
+        format: Annotated[  # noqa: A002 - the API's word
+            Literal["stored", "wav"], Query(description="as it is stored, or decoded to 24-bit WAV, always whole")
+        ] = "stored",
+    ) -> Response:
+        """A recording, for operators. `Range` gives parts of it as it is stored."""
+        path = None if clips is None else clips.folder.file(event_id, name)
+        if path is None:
+            raise HTTPException(404, f"event {event_id!r} has no recording {name!r}; GET events/ID/clips lists them")
+        if format == "wav" and path.suffix != ".wav":
+            return Response(_as_wav(path), media_type=MEDIA_TYPES[".wav"])
+        return _sound_file(path)
+
+
+def _sound_file(path: Path, filename: str | None = None) -> Response:
+    """Return a recording as it is stored; with a file name, under which people save it."""
+    headers = {"Cache-Control": "private, no-cache"}
+    media_type = MEDIA_TYPES[path.suffix]
+    return FileResponse(
+        path, media_type=media_type, headers=headers, filename=filename, content_disposition_type="inline"
+    )
 
 
 def _no_clip(event_id: str) -> HTTPException:

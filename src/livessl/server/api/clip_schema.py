@@ -59,6 +59,10 @@ class EventClips(BaseModel):
     keep: bool = Field(description="Whether the recordings are kept for ever.")
     position_m: PositionM | None = Field(description="Place at which the enhanced signal is beamed; null if none.")
     files: list[ClipFile] = Field(description="The recordings, the enhanced one first.")
+    methods: list[str] = Field(
+        description="Methods by which `POST events/{id}/relocate` can locate the event again; empty if it cannot.",
+        examples=[["onset", "srp-phat"]],
+    )
 
 
 class ClipsState(BaseModel):

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
+import numpy as np
 import orjson
 
 from livessl.clock import utc_text
@@ -104,7 +105,7 @@ class Messages:
             "late": event.late,
             "replaces": list(replaces),
             "source": event.source,
-            "candidates": _candidates(event.estimate),
+            "candidates": candidates(event.estimate),
         }
 
     def update(self, update: Update, stages: Stages | None = None) -> JsonObject:
@@ -122,7 +123,7 @@ class Messages:
             "status": str(update.status),
             "contributions": [_contribution(c) for c in update.contributions],
             "others": [self._other(other) for other in update.others],
-            "candidates": _candidates(update.estimate),
+            "candidates": candidates(update.estimate),
             "zones": self._zones().holding(position),
             "level_dbfs": dbfs(update.power),
             "latency_s": None if stages is None else round(stages.total, 4),
@@ -169,9 +170,33 @@ def where(
     return _metres(estimate.position_m), covariance, round(estimate.confidence, 4), list(estimate.arrays)
 
 
-def _candidates(estimate: Estimate | None) -> list[JsonObject]:
-    candidates = () if estimate is None else estimate.candidates
-    return [{"position_m": _metres(each.position_m), "probability": round(each.probability, 4)} for each in candidates]
+def answer(event: Event) -> JsonObject:
+    """Where an event was, by which method, and how sure: the `LocationAnswer` of `livessl.schema.relocation`."""
+    position, covariance, confidence, arrays = where(event.estimate)
+    return {
+        "method": event.method,
+        "status": str(event.status),
+        "reason": event.reason,
+        "position_m": position,
+        "covariance_m2": covariance,
+        "std_m": std_m(covariance),
+        "confidence": confidence,
+        "arrays": arrays,
+        "candidates": candidates(event.estimate),
+    }
+
+
+def std_m(covariance_m2: list[list[float]] | None) -> float | None:
+    """Standard deviation, in metres, along the axis of largest uncertainty; None without a covariance."""
+    if covariance_m2 is None:
+        return None
+    return round(float(np.sqrt(max(0.0, np.linalg.eigvalsh(covariance_m2)[-1]))), 4)
+
+
+def candidates(estimate: Estimate | None) -> list[JsonObject]:
+    """Places that explain a sound about equally well, as they are published."""
+    found = () if estimate is None else estimate.candidates
+    return [{"position_m": _metres(each.position_m), "probability": round(each.probability, 4)} for each in found]
 
 
 def array_status(status: ArrayStatus, node: str | None, activity: ActivityParameters) -> JsonObject:

@@ -164,7 +164,7 @@ def _add_heat_map(router: APIRouter, parts: Parts, searched: Any) -> None:
         spacing_m: Annotated[float, Query(ge=0.01, le=100, description="edge of a cell in metres")] = 0.25,
         format: Annotated[Literal["json", "png"], Query(description="numbers, or picture")] = "json",  # noqa: A002
     ) -> Response:
-        """How many events lie in each cell of the floor plan; with format=png a picture of it, y upwards."""
+        """Number of events in each cell of the floor plan; with format=png a picture of it, y upwards."""
         cells = Cells(low_mm, high_mm, round(1000 * spacing_m))
         if cells.shape[0] * cells.shape[1] > MAX_CELLS:
             most = f"{cells.shape[0]} x {cells.shape[1]}"

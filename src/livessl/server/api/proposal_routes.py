@@ -20,7 +20,8 @@ from livessl.server.api.queries import unprocessable
 from livessl.server.api.routes import as_json
 from livessl.server.api.set_up_routes import PLACE_STD_M
 from livessl.server.parts import Parts
-from livessl.server.proposals import REFINED_SOUNDS, BusyError, Proposal, ProposalRefusedError, Refinement
+from livessl.server.pose_refiner import REFINED_SOUNDS, Refinement
+from livessl.server.proposals import BusyError, Proposal, ProposalRefusedError
 from livessl.server.set_up_in_force import CalibrationFileError, OutOfDateError, SetUpChangedError
 from livessl.site.models import Site
 
@@ -40,14 +41,14 @@ def proposal_routes(parts: Parts) -> APIRouter:
 
     @router.get("/api/v1/set-up", response_model=set_up_schema.SetUp)
     def get_set_up() -> Response:
-        """Where the arrays are, the calibration file, and what the sounds so far say of the poses."""
+        """Poses of the arrays, the calibration file, and whether the sounds so far agree with the poses."""
         return as_json(
             {
                 "v": API_VERSION,
                 "calibration": set_up.describe(),
                 "arrays": _arrays(parts),
                 "next_place_m": first.of(set_up.site),
-                "refinement": _refinement(proposals.refinement),
+                "refinement": _refinement(parts.refiner.refinement),
             }
         )
 

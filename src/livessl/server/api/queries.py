@@ -128,9 +128,9 @@ def check_parameters(given: Iterable[str], model: type[BaseModel]) -> None:
             raise ValueError(unknown_parameter(name, list(model.model_fields)))
 
 
-def unprocessable(name: str, what: str) -> HTTPException:
-    """A 422 in FastAPI's form, for a query parameter whose value is not valid."""
-    return HTTPException(422, [{"type": "value_error", "loc": ["query", name], "msg": what}])
+def unprocessable(name: str, what: str, part: str = "query") -> HTTPException:
+    """A 422 in FastAPI's form, for a query parameter, or a key of another part, whose value is not valid."""
+    return HTTPException(422, [{"type": "value_error", "loc": [part, name], "msg": what}])
 
 
 def instant(name: str, text: str | None) -> int | None:

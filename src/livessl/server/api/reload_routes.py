@@ -20,7 +20,7 @@ _log = logging.getLogger(__name__)
 
 
 class ReloadResult(BaseModel):
-    """What a reload of the site file did."""
+    """Result of a reload of the site file."""
 
     v: Version
     changed: list[str] = Field(description="Keys that took effect.", examples=[["zones.door.bounds_m"]])

@@ -128,7 +128,7 @@ def state_routes(parts: Parts) -> APIRouter:
     def get_health(request: Request) -> Response:
         """Condition of the server and of its arrays; without a token the status alone. The code is 503 on failure."""
         arrays = parts.array_states.describe()
-        status, reasons = _condition(parts, arrays)
+        status, reasons = condition(parts, arrays)
         code = 503 if status == "failed" else 200
         if request.scope["client_role"] is None:
             return as_json({"v": API_VERSION, "status": status}, code)
@@ -150,8 +150,8 @@ def state_routes(parts: Parts) -> APIRouter:
     return router
 
 
-def _condition(parts: Parts, arrays: Sequence[JsonObject]) -> tuple[str, list[str]]:
-    """Status of the server, and the reasons for it."""
+def condition(parts: Parts, arrays: Sequence[JsonObject]) -> tuple[str, list[str]]:
+    """Return the status of the server, and the reasons for it."""
     reasons = [f"{a['name']}: {a['reason']}" for a in arrays if a["reason"] is not None]
     states = {a["state"] for a in arrays if a["enabled"]}  # an operator disables an array on purpose
     status = "ok" if states == {"healthy"} else "starting" if states <= {"starting", "healthy"} else "degraded"

@@ -21,7 +21,7 @@ from livessl.server.heard_sounds import HeardSound
 from livessl.server.parts import Parts
 
 PLACE_STD_M: Final = 0.03
-"""How exactly the places of claps are taken to be known where nobody says it, metres."""
+"""Standard deviation of the places of claps, in metres, unless the request gives another one."""
 
 _TEXTS = {
     404: "One of the sounds is not kept: the last 64 are.",

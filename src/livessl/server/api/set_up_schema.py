@@ -23,7 +23,7 @@ PlaceM = Annotated[
 
 
 def _whole(value: object) -> object:
-    """Refuse what is a number in Python, but none in JSON."""
+    """Refuse values that are numbers in Python but not in JSON."""
     if isinstance(value, bool | str | bytes):
         raise ValueError("expected a whole number")
     return value
@@ -163,7 +163,7 @@ class AcceptRequest(BaseModel):
 
 
 class PlacedMicrophones(BaseModel):
-    """Where an array is."""
+    """Position of an array and its microphones."""
 
     position_m: PositionM = Field(description="Mean position of the microphones [x, y, z] in metres.")
     microphones_m: list[PositionM] = Field(description="Position of each microphone in channel order, in metres.")
@@ -200,7 +200,7 @@ class ProposedPose(BaseModel):
 
 
 class MeasuredSpeed(BaseModel):
-    """The speed of sound that sounds say."""
+    """The speed of sound, measured by the sounds."""
 
     speed_of_sound_m_s: float = Field(gt=0, description="Metres a second.", examples=[344.2])
     std_m_s: float = Field(ge=0, description="Its standard deviation, in metres a second.", examples=[0.6])
@@ -208,7 +208,7 @@ class MeasuredSpeed(BaseModel):
 
 
 class FittedClap(BaseModel):
-    """How far a sound was found from where it was made, by its delays alone."""
+    """Distance between the place of a sound and where its delays alone place it."""
 
     number: Number
     place_m: PlaceM
@@ -260,7 +260,7 @@ class Calibration(BaseModel):
 
 
 class Refinement(BaseModel):
-    """What the sounds that were located so far say of the poses in force."""
+    """Agreement of the sounds that were located so far with the poses in force."""
 
     sounds: int = Field(ge=0, description="Number of kept sounds that two arrays received.", examples=[24])
     needed: int = Field(ge=0, description="Number from which poses are refined.", examples=[20])
@@ -279,7 +279,7 @@ class SetUp(BaseModel):
 
 
 class Changed(BaseModel):
-    """What a change of the set-up has changed."""
+    """Result of a change of the set-up."""
 
     v: Version
     changed: list[str] = Field(description="Arrays whose poses are other ones now.", examples=[["south"]])

@@ -20,6 +20,30 @@ that is too quiet to be active."""
 
 
 @dataclass(frozen=True, slots=True)
+class CutFrame:
+    """A frame's place in a recording, and what its node and the fusion said about it.
+
+    Parameters
+    ----------
+    frame_index : int
+        Index on the joint grid of frames: the known offset of the array's clock is subtracted.
+    begin, length : int
+        Number of its first sample in the recording, and number of its samples.
+    power : float
+        In-band mean power, full scale squared.
+    active, requested : bool
+        As in `Frame`.
+    """
+
+    frame_index: int
+    begin: int
+    length: int
+    power: float
+    active: bool
+    requested: bool
+
+
+@dataclass(frozen=True, slots=True)
 class Cut:
     """The samples that an array recorded around an event.
 
@@ -35,6 +59,8 @@ class Cut:
         Begin and end of each gap, in seconds after the first sample.
     known, active : (n,) bool
         Where there are samples, and where the array's activity detection found sound.
+    frames : tuple of CutFrame
+        The frames that it was joined from, in order.
     """
 
     spec: ArraySpec
@@ -44,6 +70,7 @@ class Cut:
     gaps_s: tuple[tuple[float, float], ...]
     known: BoolArray
     active: BoolArray
+    frames: tuple[CutFrame, ...]
 
     def __post_init__(self) -> None:
         for array in (self.samples, self.known, self.active):
@@ -55,7 +82,7 @@ class Cut:
         return float(self.samples.shape[1] / self.sample_rate_hz)
 
     def sound(self, start_ns: int, end_ns: int) -> ArraySound:
-        """Return it for the enhancement of an event, given the span of the event's active frames in site time."""
+        """Return this cut as input of the enhancement; the times span the event's active frames, in site time."""
         begin, end = (round((at_ns - self.time_ns) / 1e9 * self.sample_rate_hz) for at_ns in (start_ns, end_ns))
         at = np.arange(len(self.known))
         before = at < begin - round(GUARD_NS / 1e9 * self.sample_rate_hz)
@@ -65,7 +92,7 @@ class Cut:
         return ArraySound(self.spec, self.time_ns, self.sample_rate_hz, self.samples, self.known, quiet, during)
 
 
-def cut(spec: ArraySpec, frames: Sequence[Frame], offset_ns: int = 0) -> Cut | None:
+def cut(spec: ArraySpec, frames: Sequence[Frame], offset_ns: int = 0, frames_ahead: int = 0) -> Cut | None:
     """Return the recording that frames of one array make.
 
     Parameters
@@ -76,6 +103,8 @@ def cut(spec: ArraySpec, frames: Sequence[Frame], offset_ns: int = 0) -> Cut | N
         last one are left out.
     offset_ns : int
         How far the array's clock is ahead.
+    frames_ahead : int
+        Whole frames of that by which the fusion corrects the array's frame indices.
 
     Returns
     -------
@@ -92,6 +121,7 @@ def cut(spec: ArraySpec, frames: Sequence[Frame], offset_ns: int = 0) -> Cut | N
     known: list[BoolArray] = []
     active: list[BoolArray] = []
     gaps_s: list[tuple[float, float]] = []
+    placed: list[CutFrame] = []
     length = 0
 
     def add(samples: Float32Array, is_known: bool, is_active: bool) -> None:
@@ -106,8 +136,11 @@ def cut(spec: ArraySpec, frames: Sequence[Frame], offset_ns: int = 0) -> Cut | N
             gaps_s.append((length / rate_hz, (length + count) / rate_hz))
             add(np.zeros((channels, count), dtype=np.float32), False, False)
             length += count
+        count, index = frame.samples.shape[1], frame.frame_index - frames_ahead
+        placed.append(CutFrame(index, length, count, frame.power, frame.active, frame.requested))
         add(frame.samples, True, frame.active)
-        length += frame.samples.shape[1]
+        length += count
     joined = np.concatenate(parts, axis=1)
     time_ns = used[0].time_ns - offset_ns
-    return Cut(spec, time_ns, rate_hz, joined, tuple(gaps_s), np.concatenate(known), np.concatenate(active))
+    masks = np.concatenate(known), np.concatenate(active)
+    return Cut(spec, time_ns, rate_hz, joined, tuple(gaps_s), *masks, tuple(placed))

@@ -46,7 +46,50 @@ class _Entry:
     keep: bool
 
 
-class ClipFolder:
+class ClipReader:
+    """The clips in a folder, to be read only; another process may write and delete them.
+
+    Parameters
+    ----------
+    path : Path
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def ids(self) -> list[str]:
+        """Return the ids of the events that have a clip, in order of their names.
+
+        Raises
+        ------
+        ClipsError
+            If the folder cannot be read.
+        """
+        try:
+            folders = [folder for folder in self._path.iterdir() if _SAFE.fullmatch(folder.name)]
+            return sorted(folder.name for folder in folders if (folder / ABOUT).is_file())
+        except OSError as error:
+            raise ClipsError(f"{self._path}: expected a folder of clips: {error.strerror or error}; name it") from error
+
+    def about(self, event_id: str) -> About | None:
+        """Return what is known of an event's clip; None if it has none."""
+        if not _SAFE.fullmatch(event_id):
+            return None
+        try:
+            return _parsed((self._path / event_id / ABOUT).read_bytes())
+        except OSError:
+            return None
+
+    def file(self, event_id: str, name: str) -> Path | None:
+        """Return the path of one of a clip's recordings; None if there is none of that name."""
+        about = self.about(event_id)
+        if about is None or name not in {each["name"] for each in about["files"]}:
+            return None
+        path = self._path / event_id / name
+        return path if path.is_file() else None
+
+
+class ClipFolder(ClipReader):
     """All clips of a site. Every thread may call it.
 
     Parameters
@@ -61,7 +104,7 @@ class ClipFolder:
     """
 
     def __init__(self, path: Path) -> None:
-        self._path = path
+        super().__init__(path)
         self._lock = threading.RLock()
         self._erasing = threading.Lock()  # is never held while waiting for the other lock
         self._entries: dict[str, _Entry] = {}
@@ -137,23 +180,6 @@ class ClipFolder:
         """Bytes of the clips that are kept for ever."""
         with self._lock:
             return sum(entry.nbytes for entry in self._entries.values() if entry.keep)
-
-    def about(self, event_id: str) -> About | None:
-        """Return what is known of an event's clip; None if it has none."""
-        if not _SAFE.fullmatch(event_id):
-            return None
-        try:
-            return _parsed((self._path / event_id / ABOUT).read_bytes())
-        except OSError:
-            return None
-
-    def file(self, event_id: str, name: str) -> Path | None:
-        """Return the path of one of a clip's recordings; None if there is none of that name."""
-        about = self.about(event_id)
-        if about is None or name not in {each["name"] for each in about["files"]}:
-            return None
-        path = self._path / event_id / name
-        return path if path.is_file() else None
 
     def put(self, event_id: str, write: Callable[[Path], Mapping[str, Any]]) -> About:
         """Store a clip in place of an earlier one of the same event, which stays kept for ever if it was.

@@ -1,9 +1,9 @@
-"""Writes one event's clip: a file of each array, and the signal that is beamed at the event's place."""
+"""Writes one event's clip: a file of each array, and one signal enhanced by beams towards the event's position."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, astuple, dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -13,6 +13,7 @@ from livessl.clock import utc_text
 from livessl.core.enhance.enhance import Enhancement, plan
 from livessl.core.types import Event, Float32Array, FloatArray
 from livessl.recordings.sound_file import FLAC_MAX_CHANNELS, Format, SoundWriter
+from livessl.server.api.encode import answer
 from livessl.server.clips.cut import Cut
 
 ENHANCED: Final = "enhanced.flac"
@@ -47,7 +48,7 @@ class Recipe:
 
 
 def write_clip(recipe: Recipe, folder: Path) -> dict[str, Any]:
-    """Write the recordings of a clip into a folder, and return what to say of them.
+    """Write the recordings of a clip into a folder, and return their description for JSON.
 
     Raises
     ------
@@ -67,6 +68,20 @@ def write_clip(recipe: Recipe, folder: Path) -> dict[str, Any]:
         "duration_s": round(event.duration_s, 6),
         "position_m": None if estimate is None else [round(float(x), 4) for x in estimate.position_m],
         "files": files,
+        "answer": answer(event),
+        "c_m_s": recipe.c_m_s,
+        "arrays": {cut.spec.name: _set_up_and_frames(cut) for cut in recipe.cuts},
+    }
+
+
+def _set_up_and_frames(cut: Cut) -> dict[str, Any]:
+    """Return what locating the event again needs besides the samples: where the microphones are, and the frames."""
+    return {
+        "time_ns": cut.time_ns,
+        "sample_rate_hz": cut.sample_rate_hz,
+        "microphones_m": cut.spec.microphones_m.tolist(),
+        "uncertainty": asdict(cut.spec.uncertainty),
+        "frames": [list(astuple(frame)) for frame in cut.frames],
     }
 
 
@@ -89,7 +104,7 @@ def _write_array(event: Event, cut: Cut, folder: Path) -> dict[str, Any]:
 
 
 def _write_enhanced(recipe: Recipe, folder: Path) -> dict[str, Any] | None:
-    """Write the enhanced signal from the arrays of which the estimate was made; None if none of them has sound."""
+    """Write the enhanced signal from the arrays that the estimate used; None if none of them has sound."""
     event, estimate = recipe.event, recipe.event.estimate
     if estimate is None:
         return None

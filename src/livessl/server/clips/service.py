@@ -53,12 +53,20 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
+class _Ahead:
+    """How far an array's clock is ahead, and the whole frames of that by which the fusion corrects frame indices."""
+
+    ns: int
+    frames: int
+
+
+@dataclass(frozen=True, slots=True)
 class _Job:
-    """An event that waits for its clip until a monotonic time, and how far each array's clock is ahead (ns)."""
+    """An event that waits for its clip until a monotonic time, and how far each array's clock is ahead."""
 
     event: Event
     due_ns: int
-    offsets_ns: dict[str, int]
+    ahead: dict[str, _Ahead]
 
 
 @dataclass(slots=True)
@@ -155,14 +163,11 @@ class Clips:
             self.counts.shed += 1
             return
         names = [name for name in self._specs if name in event.heard_by or name in estimate.arrays]
-        offsets_ns = {
-            name: round(1e9 * (clock_offsets.frames_ahead(name) * FRAME_S + clock_offsets.rest_s(name)))
-            for name in names
-        }
+        ahead = {name: _ahead(clock_offsets, name) for name in names}
         longest_ns = round(1e9 * self._config.post_s) + SETTLE_NS
         wait_ns = min(max(event.end_ns + longest_ns - self._clock.now_ns(), 0), longest_ns)
         with self._lock:
-            self._waiting.append(_Job(event, self._clock.monotonic_ns() + wait_ns, offsets_ns))
+            self._waiting.append(_Job(event, self._clock.monotonic_ns() + wait_ns, ahead))
 
     # --- for the API
 
@@ -270,8 +275,8 @@ class Clips:
         begin_ns = job.event.start_ns - round(1e9 * self._config.pre_s)
         end_ns = job.event.end_ns + round(1e9 * self._config.post_s)
         found = (
-            cut(self._specs[name], self._ring.between(name, begin_ns + offset_ns, end_ns + offset_ns), offset_ns)
-            for name, offset_ns in job.offsets_ns.items()
+            cut(self._specs[name], self._ring.between(name, begin_ns + at.ns, end_ns + at.ns), at.ns, at.frames)
+            for name, at in job.ahead.items()
         )
         return [each for each in found if each is not None]
 
@@ -297,6 +302,11 @@ class Clips:
         if self._trouble is None:
             _log.error("%s", text)
         self._trouble = text
+
+
+def _ahead(clock_offsets: ClockOffsets, array: str) -> _Ahead:
+    frames = clock_offsets.frames_ahead(array)
+    return _Ahead(round(1e9 * (frames * FRAME_S + clock_offsets.rest_s(array))), frames)
 
 
 def lacks(each: Cut, event: Event) -> bool:

@@ -29,6 +29,7 @@ from livessl.server.forwarding.stream import (
     Place,
     connect_options,
     connected,
+    ended,
     message_id,
     nats_library,
     subject,
@@ -122,7 +123,7 @@ class HubLink:
 
     @property
     def problem(self) -> str | None:
-        """Why messages wait, as a sentence for the reasons of `health`; None while they are sent."""
+        """Reason why messages wait, as a sentence for `health`; None while they are sent."""
         if self._problem is None:
             return None
         return f"{PLACE}: {self._problem}; {self.waiting} messages wait for the hub"
@@ -219,9 +220,7 @@ class HubLink:
         try:
             done, _ = await asyncio.wait((sending, ending), return_when=asyncio.FIRST_COMPLETED)
         finally:
-            for task in (sending, ending):
-                task.cancel()
-            await asyncio.gather(sending, ending, return_exceptions=True)
+            await ended(sending, ending)
         if sending in done:
             sending.result()  # raises the error that ended it
 

@@ -42,6 +42,9 @@ RECONNECT_S: Final = 0.25
 CLOSE_S: Final = 1.0
 """Longest time, in seconds, that the end of a connection may take."""
 
+CANCEL_S: Final = 0.1
+"""Wait, in seconds, before a task that goes on is cancelled again."""
+
 PING_S: Final = 5
 """Interval, in seconds, of the pings by which a dead connection is noticed, after two that are not answered."""
 
@@ -145,6 +148,20 @@ async def connected(
         with suppress(Exception):
             async with asyncio.timeout(CLOSE_S):
                 await client.close()
+
+
+async def ended(*tasks: asyncio.Task[Any]) -> None:
+    """End tasks, and return when they have ended, whatever they say to it.
+
+    A task is cancelled again as long as it goes on: Python 3.11 loses a cancellation that comes at the moment at which
+    what `wait_for` waits for is there, as the next message is all the time under load.
+    """
+    left = set(tasks)
+    while left:
+        for task in left:
+            task.cancel()
+        _, left = await asyncio.wait(left, timeout=CANCEL_S)
+    await asyncio.gather(*tasks, return_exceptions=True)  # takes note of their errors
 
 
 def _insist_on_tls(client: Any, nats: Any) -> None:

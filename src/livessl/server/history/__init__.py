@@ -1,4 +1,5 @@
 """The database of the history: its tables and their migrations, connections, searches, exports and heat map.
 
-`livessl.server.store` is the door to it. Only this package knows SQLAlchemy and Alembic.
+`livessl.server.store` is the door to it, and `livessl.server.event_retention` deletes what is too old. Only this
+package knows SQLAlchemy and Alembic.
 """

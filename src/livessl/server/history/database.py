@@ -127,7 +127,7 @@ class Database:
 
     @property
     def problem(self) -> str | None:
-        """Why the tables could not be prepared yet; None if they are."""
+        """Reason why the tables could not be prepared yet; None if they are."""
         return None if self._is_prepared else self._problem
 
     def prepare(self) -> bool:

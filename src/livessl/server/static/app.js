@@ -14,8 +14,9 @@ import { MapPanel } from "./map-panel.js";
 import { Model, OLD_MS } from "./model.js";
 import { drawTogether, Plan } from "./plan.js";
 import { ZoneEditor } from "./plan-zones-editor.js";
+import { Relocate } from "./relocate.js";
 import { SetUp } from "./set-up.js";
-import { readColours } from "./theme.js";
+import { readColours } from "./plan-style.js";
 
 const API = new URL("api/v1/", document.baseURI);
 /** Events that are loaded from the store when the page connects. */
@@ -46,7 +47,10 @@ const arraysPanel = new ArraysPanel(find("arrays"), find("arrays-empty"), (name,
   const address = new URL(`arrays/${encodeURIComponent(name)}/enabled`, API);
   put(address, { enabled }).catch((error) => console.warn(`livessl: array ${name}:`, error.message));
 });
-const clips = new Clips(API);
+const clips = new Clips(API, new Relocate(API, (id, answer) => {
+  model.setAgain(id, answer);
+  redraw();
+}));
 const eventList = new EventList(find("events"), {
   empty: find("events-empty"),
   count: find("events-count"),

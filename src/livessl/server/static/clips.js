@@ -11,8 +11,10 @@ const ATTEMPTS = 60;
 const MOST_HELD = 8;
 
 export class Clips {
-  constructor(api) {
+  /** `relocate` makes the form by which an event is located again. */
+  constructor(api, relocate) {
     this.api = api;
+    this.relocate = relocate;
     /** Whether the user may listen, keep and delete. */
     this.mayListen = false;
     this.held = [];
@@ -49,6 +51,8 @@ export class Clips {
       this.mayListen
         ? this.#tools(found, section)
         : el("p", { className: "clip-note", text: "Sign in as an operator to listen." }));
+    const form = this.mayListen ? this.relocate.form(found) : null;
+    if (form !== null) section.append(form);
   }
 
   #item(id, file) {

@@ -7,7 +7,7 @@ import { EventList } from "./events.js";
 import { counted, when } from "./format.js";
 import { Model } from "./model.js";
 import { Plan } from "./plan.js";
-import { readColours } from "./theme.js";
+import { readColours } from "./plan-style.js";
 
 const API = new URL("api/v1/", document.baseURI);
 /** Events on a page. */

@@ -39,6 +39,8 @@ export class Model {
     this.tracks = new Map();
     /** The event that is pointed at or selected in the list, as a marker, or null. */
     this.highlight = null;
+    /** The answer for the event that was located again last, as a marker with its id, or null. */
+    this.again = null;
     /** The last messages that report a latency, newest last. */
     this.latencies = { update: [], event: [] };
     this.serverClock = new ServerClock();
@@ -128,6 +130,11 @@ export class Model {
     this.highlight = event === null ? null : { ...marker(event, 0), label };
   }
 
+  /** Mark on the plans where an event was found when it was located again, while the event is highlighted; null for nowhere. */
+  setAgain(id, answer) {
+    this.again = answer === null ? null : { ...marker({ ...answer, id }, 0), label: `again: ${answer.method}` };
+  }
+
   /** Remove what has not been updated for too long. */
   expire(now) {
     for (const [id, { bornMs }] of this.current) if (now - bornMs > UPDATE_SHOWN_MS) this.current.delete(id);
@@ -159,6 +166,7 @@ export class Model {
       tracks: [...this.tracks.values()],
       estimates,
       highlight: this.highlight,
+      again: this.again !== null && this.again.id === this.highlight?.id ? { ...this.again, bornMs: now } : null,
     };
   }
 

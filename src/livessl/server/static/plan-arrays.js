@@ -1,6 +1,6 @@
 // The layer of a plan that shows an array: its microphones, its name, its state, and whether it receives sound.
 
-import { LABEL } from "./theme.js";
+import { LABEL } from "./plan-style.js";
 
 /** Least radius of an array's outline, and its distance from the outermost microphone, in pixels. */
 const LEAST_RADIUS = 11;

@@ -3,7 +3,7 @@
 import { number } from "./format.js";
 import { direction, ellipse95, rayEnd } from "./geometry.js";
 import { OLD_MS } from "./model.js";
-import { LABEL } from "./theme.js";
+import { LABEL } from "./plan-style.js";
 
 /** Age, in milliseconds, at which an estimate begins to fade. */
 const FRESH_MS = 1200;

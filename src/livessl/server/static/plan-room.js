@@ -2,7 +2,7 @@
 
 import { number } from "./format.js";
 import { opacity } from "./colour-map.js";
-import { SMALL } from "./theme.js";
+import { SMALL } from "./plan-style.js";
 
 /** Least distance in pixels between lines of the grid, and between labels of an axis. */
 const GRID_GAP = 18;

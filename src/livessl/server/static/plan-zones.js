@@ -1,6 +1,6 @@
 // Layers of a plan that show the zones, the one that is being drawn, and the picture of the floor plan.
 
-import { SMALL } from "./theme.js";
+import { SMALL } from "./plan-style.js";
 
 /** Distance in pixels between the hatching lines of excluded zones. */
 const HATCH_GAP = 9;

@@ -86,10 +86,11 @@ export class Plan {
       drawDraft(this, scene.draft);
     });
     for (const array of scene.arrays) drawArray(this, array);
-    const { highlight } = scene;
+    const { highlight, again } = scene;
     const others = scene.estimates.filter(({ id }) => id !== highlight?.id);
     for (const estimate of others) drawEstimate(this, estimate, scene, false);
     if (highlight) drawEstimate(this, highlight, scene, true);
+    if (again) drawEstimate(this, again, scene, false);
   }
 
   /** The one estimate whose coordinates are marked on the axes: the highlighted one, or else the newest. */

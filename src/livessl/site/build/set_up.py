@@ -1,4 +1,4 @@
-"""What sounds say of a site's set-up: faults, with the inputs of the site's devices, and the poses of the arrays."""
+"""Examines a site's set-up by sounds: faults, with the inputs of the site's devices, and the poses of the arrays."""
 
 from __future__ import annotations
 
@@ -7,20 +7,27 @@ from typing import Final
 
 import numpy as np
 
+from livessl.core.commission.blind_spots import BlindSpot, blind_spots
 from livessl.core.commission.diagnosis import verify
 from livessl.core.commission.finding import Finding
-from livessl.core.commission.findings import channel_findings, find_faults, set_up_findings, sharp_delays
+from livessl.core.commission.findings import channel_findings, find_faults, set_up_findings, sharp_delays, stds_s
 from livessl.core.commission.next_place import proposed_place
 from livessl.core.commission.places import Delays, Microphones, PlaceSearch
 from livessl.core.commission.refine import refine
 from livessl.core.commission.resection import MeasuredSetUp, measure_poses
-from livessl.core.types import FloatArray, Observation
+from livessl.core.commission.set_up import ORIENTATION_STD_DEG, POSITION_STD_M, Freedom, Known, careful
+from livessl.core.types import FloatArray, Observation, Uncertainty
 from livessl.site.build.grid import search_grid
 from livessl.site.build.inputs import with_inputs
 from livessl.site.models import Site
 
 OUTSIDE_M: Final = 5.0
 """Distance from the room, in metres, beyond which a place is a mistake: an origin or a unit that is not the site's."""
+
+
+LEAST_POSITION_STD_M: Final = 0.01
+LEAST_ORIENTATION_STD_DEG: Final = 0.4
+"""Least standard deviations of a pose along each axis, in metres and degrees: those after a good calibration."""
 
 
 class PlaceOutsideError(ValueError):
@@ -48,8 +55,33 @@ def require_near_room(site: Site, places_m: FloatArray) -> None:
 def find_set_up_faults(site: Site, sounds: Sequence[Sequence[Observation]]) -> list[Finding]:
     """Find what the observations of some sounds say about a site's channels, poses and speed of sound."""
     microphones = {spec.name: spec.microphones_m for spec in site.processed}
-    findings = find_faults(microphones, sounds, np.array(search_grid(site).bounds_m), site.c_m_s)
-    return with_inputs(site, findings)
+    bounds_m = np.array(search_grid(site).bounds_m)
+    return with_inputs(site, find_faults(microphones, sounds, bounds_m, site.c_m_s, freedom_of(site)))
+
+
+def hidden_by(site: Site, sounds: Sequence[Sequence[Observation]]) -> tuple[BlindSpot, ...]:
+    """Return the faults of poses that the observations of some sounds could not have shown."""
+    microphones = {spec.name: spec.microphones_m for spec in site.processed}
+    joint = [sound for sound in sounds if len(sound) > 1]
+    delays = sharp_delays(microphones, joint, channel_findings(microphones, sounds))
+    known = Known(freedom_of(site), stds_s(delays, joint))
+    return blind_spots(microphones, delays, np.array(search_grid(site).bounds_m), site.c_m_s, known)
+
+
+def freedom_of(site: Site) -> dict[str, Freedom]:
+    """Return how far each array may be from where the site has it.
+
+    That is what a careful set-up may be off by where `uncertainty` has its default, and in proportion to it elsewhere,
+    such as after a calibration, but no less than a calibration can know.
+    """
+    usual = Uncertainty()
+    freedom: dict[str, Freedom] = {}
+    for spec in site.processed:
+        known = spec.uncertainty
+        position_m = max(LEAST_POSITION_STD_M, POSITION_STD_M * known.position_m / usual.position_m)
+        turn_deg = max(LEAST_ORIENTATION_STD_DEG, ORIENTATION_STD_DEG * known.orientation_deg / usual.orientation_deg)
+        freedom |= careful({spec.name: spec.microphones_m}, position_m, turn_deg)
+    return freedom
 
 
 def verify_set_up(site: Site, sounds: Sequence[Sequence[Observation]], places_m: FloatArray) -> list[Finding]:

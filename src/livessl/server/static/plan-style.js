@@ -1,4 +1,4 @@
-// The plans' fonts, and their colours, read from the style sheet so that canvases and page share one palette.
+// The plans' fonts, and their colours as base.css gives them for light and dark, so that canvases and page share them.
 
 const NAMES = ["paper", "panel", "grid", "wall", "zone", "text", "muted", "estimate", "marked", "old", "halo"];
 const FACE = '"Segoe UI", Roboto, "Noto Sans", "Helvetica Neue", "Liberation Sans", Arial, sans-serif';

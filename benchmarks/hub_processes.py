@@ -1,0 +1,97 @@
+"""A NATS server, a database and a hub as processes, and how long the hub's answers take."""
+
+from __future__ import annotations
+
+import random
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Final
+
+import httpx
+import psycopg
+
+from history import Times
+from history_rows import START_NS
+from hub_sites import site_name
+from hub_world import HubProcess
+from livessl.clock import SystemClock, utc_text
+from livessl.lab.processes import end, wait_until_ready
+from livessl.server.api.encode import JsonObject
+from nats_servers import NatsServer, running_nats
+from postgresql import SETTINGS, PostgreSQL, running_postgresql
+from processor_time import processor_s
+from small_site import wait_until
+
+REQUEST_S: Final = 0.05
+"""Interval, in seconds, at which the API is asked."""
+
+
+@dataclass
+class World:
+    """The processes of a run."""
+
+    server: NatsServer
+    hub: HubProcess
+    postgresql: PostgreSQL | None
+    folder: Path
+
+    def processor_s(self) -> dict[str, float]:
+        """Return the processor time so far of each part, in seconds."""
+        database = self.postgresql and self.postgresql.pid
+        pids = {"hub": self.hub.process.pid, "nats": self.server.pid, "database": database}
+        return {name: processor_s(pid) for name, pid in pids.items() if pid}
+
+    def stored_bytes(self) -> int:
+        """Return the size of the database."""
+        if self.postgresql is None:
+            return sum(path.stat().st_size for path in self.folder.glob("hub.sqlite*"))
+        with psycopg.connect(self.postgresql.address, autocommit=True) as connection:
+            connection.execute("CHECKPOINT")
+            row = connection.execute("SELECT pg_database_size(current_database())").fetchone()
+        assert row is not None
+        return int(row[0])
+
+
+@contextmanager
+def running_hub_process(folder: Path, sqlite: bool, database: str | None = None) -> Iterator[World]:
+    """Run one NATS server and one hub, and PostgreSQL unless there is a database or SQLite is wanted."""
+    with ExitStack() as stack:
+        (folder / "nats").mkdir(exist_ok=True)
+        server = stack.enter_context(running_nats(folder / "nats"))
+        postgresql = None
+        if database is None and not sqlite:
+            settings = {**SETTINGS, "fsync": "on", "full_page_writes": "on", "shared_buffers": "128MB"}
+            postgresql = stack.enter_context(running_postgresql(settings))
+            database = postgresql.url()
+        hub = HubProcess(folder, 0, database or str(folder / "hub.sqlite"), [server.url], replicas=1)
+        stack.callback(lambda: end([hub.process]))
+        wait_until_ready(hub.url, [hub.process], SystemClock())
+        wait_until(hub.takes_in, "a hub that takes messages in")
+        yield World(server, hub, postgresql, folder)
+
+
+def measure_answers(url: str, sites: int, seconds: float) -> JsonObject:
+    """Return how long answers of the API take, asked for some seconds in turns."""
+    rng = random.Random(6)
+    requests: dict[str, Callable[[], str]] = {
+        "newest of all": lambda: "/api/v1/events",
+        "newest of a site": lambda: f"/api/v1/events?site={site_name(rng.randrange(sites))}",
+        "of a site, by time and confidence": lambda: (
+            f"/api/v1/events?site={site_name(rng.randrange(sites))}&min_confidence=0.9&since={utc_text(START_NS)}"
+        ),
+        "all sites": lambda: "/api/v1/sites",
+        "metrics": lambda: "/metrics",
+    }
+    times: dict[str, list[float]] = {kind: [] for kind in requests}
+    until = time.perf_counter() + seconds
+    with httpx.Client(base_url=url, timeout=120) as client:
+        while time.perf_counter() < until or len(times["metrics"]) < 2:
+            for kind, request in requests.items():
+                asked, begun = request(), time.perf_counter()
+                client.get(asked).raise_for_status()
+                times[kind].append(time.perf_counter() - begun)
+                time.sleep(REQUEST_S)
+    return {kind: asdict(Times.of(each)) for kind, each in times.items()}

@@ -1,0 +1,161 @@
+"""Tables about the load of hubs, made of what `hub_load.py` has measured."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from hub_sites import ARRAYS, EVENTS_PER_HOUR, MESSAGES_PER_HOUR
+from livessl.lab.evaluate.markdown import Block, Table, as_markdown
+from performance import Fit
+
+BEGIN: Final = "<!-- begin hub load -->\n"
+END: Final = "<!-- end hub load -->"
+
+STREAM_BYTES: Final = 10_000_000_000
+"""What the stream keeps by default (`stream.max_bytes`)."""
+
+MANY: Final = 100_000_000
+"""Stored events to which the fit of the answers is extended."""
+
+Json = dict[str, Any]
+
+
+def written_into(page: str, text: str) -> str:
+    """Return a page with a text in the place that its comments name.
+
+    Raises
+    ------
+    ValueError
+        If the page has no such place.
+    """
+    if BEGIN not in page or END not in page:
+        raise ValueError(f"expected the lines {BEGIN.strip()} and {END} in the page; add them where the tables belong")
+    return page[: page.index(BEGIN) + len(BEGIN)] + "\n" + text + "\n" + page[page.index(END) :]
+
+
+def document(folder: Path) -> str:
+    """Return the tables of all that was measured into a folder.
+
+    Raises
+    ------
+    ValueError
+        If there is nothing.
+    """
+    loads, histories = _read(folder, "sites"), _read(folder, "history")
+    if not loads and not histories:
+        raise ValueError(f"{folder}: expected files sites-N.json or history-N.json; measure with --sites or --history")
+    blocks: list[Block] = []
+    if loads:
+        blocks += [_about(loads), _flood(loads)]
+        paced = [load for load in loads if "paced" in load]
+        if paced:
+            blocks += ["At the pace of real time:", _paced(paced), *_limits(paced[-1])]
+            blocks += [
+                "95 % of the API's answers take at most, in ms, at the pace of real time:",
+                _answers(paced, "sites"),
+            ]
+    if histories:
+        blocks += [_about(histories), "95 % of the API's answers take at most, in ms:", _answers(histories, "history")]
+        blocks += _fit(histories)
+    return as_markdown(blocks)
+
+
+def _read(folder: Path, name: str) -> list[Json]:
+    found = [json.loads(path.read_text(encoding="utf-8")) for path in folder.glob(f"{name}-*.json")]
+    return sorted(found, key=lambda each: int(each[name]))
+
+
+def _about(runs: Sequence[Json]) -> str:
+    run = runs[-1]
+    machine = run["machine"]
+    loads = ", ".join(f"{each['machine']['load_before']:.1f}" for each in runs)
+    return (
+        f"{machine['cpu']}, {machine['cores']} cores; {run['database']}; the machine did {run['beside']} meanwhile "
+        f"(load average at the begin of each run: {loads})."
+    )
+
+
+def _flood(loads: Sequence[Json]) -> Table:
+    titles = ("sites", "arrays", "messages", "published /s", "taken in /s", "times real time", "most waiting",
+              "bytes a message, stream", "bytes an event, database")  # fmt: skip
+    rows = [
+        (
+            *(f"{load['sites']}", f"{load['sites'] * len(ARRAYS)}", _messages(load)),
+            *(f"{load['published_per_s']:.0f}", f"{load['taken_in_per_s']:.0f}"),
+            f"{load['taken_in_per_s'] / real_time_per_s(load['sites']):.0f}",
+            *(f"{load['most_waiting']}", f"{load['stream_bytes_per_message']:.0f}"),
+            f"{load['database_bytes_per_event']:.0f}",
+        )
+        for load in loads
+    ]
+    return Table(titles, rows)
+
+
+def _messages(load: Json) -> str:
+    """Return how many messages were published, of how many minutes, and whether all were taken in."""
+    return f"{load['messages']} of {load['minutes']} min{'' if load['is_drained'] else ', not all taken in'}"
+
+
+def _paced(loads: Sequence[Json]) -> Table:
+    titles = ("sites", "messages /s", "reports /s", "age of the oldest that waits: median, 95 %, longest",
+              "hub", "database", "NATS", "most memory of the hub")  # fmt: skip
+    rows = []
+    for load in loads:
+        paced, lag = load["paced"], load["paced"]["lag"]
+        shares = [paced["processor_share"].get(name) for name in ("hub", "database", "nats")]
+        rows.append(
+            (
+                *(f"{load['sites']}", f"{paced['messages_per_s']:.0f}", f"{load['sites'] / 5:.1f}"),
+                f"{lag['p50_ms'] / 1000:.2f}, {lag['p95_ms'] / 1000:.2f}, {lag['max_ms'] / 1000:.2f} s",
+                *("–" if share is None else f"{100 * share:.1f} % of a core" for share in shares),
+                f"{load['hub_memory_mb']:.0f} MB",
+            )
+        )
+    return Table(titles, rows)
+
+
+def _limits(load: Json) -> list[Block]:
+    """Return by what the number of sites is limited, the first limit first."""
+    sites, shares = load["sites"], load["paced"]["processor_share"]
+    day = 24 * MESSAGES_PER_HOUR * load["stream_bytes_per_message"]
+    stored = 24 * EVENTS_PER_HOUR * load["database_bytes_per_event"]
+    most = {f"one core of the {name}": sites / share for name, share in shares.items() if share > 0}
+    most["what the hub takes in at most"] = load["taken_in_per_s"] / real_time_per_s(1)
+    most["the stream's 10 GB, to keep a day"] = STREAM_BYTES / day
+    rows = [(name, f"{count:.0f}") for name, count in sorted(most.items(), key=lambda each: each[1])]
+    costs = (
+        f"A site of {len(ARRAYS)} arrays with {EVENTS_PER_HOUR} events an hour sends {MESSAGES_PER_HOUR} messages an "
+        f"hour, which take {day / 1e6:.1f} MB of the stream and {stored / 1e6:.1f} MB of the database a day, "
+        f"{' and '.join(f'{1e6 * share / sites:.0f} µs/s of the {name}' for name, share in shares.items())}."
+    )
+    return [costs, f"Limits, by the figures of {sites} sites:", Table(("limit", "sites"), rows)]
+
+
+def _answers(runs: Sequence[Json], key: str) -> Table:
+    def answers(run: Json) -> Json:
+        found: Json = run["answers"] if "answers" in run else run["paced"]["answers"]
+        return found
+
+    kinds = list(answers(runs[-1]))
+    rows = [(f"{run[key]}", *(f"{answers(run)[kind]['p95_ms']:.1f}" for kind in kinds)) for run in runs]
+    return Table(("stored events" if key == "history" else key, *kinds), rows)
+
+
+def _fit(runs: Sequence[Json]) -> list[Block]:
+    """Return what a power law says of more events than were stored; nothing if there are too few steps."""
+    if len(runs) < 3:
+        return []
+    lines = []
+    counts = [float(run["history"]) for run in runs]
+    for kind in runs[-1]["answers"]:
+        fit = Fit.power(counts, [run["answers"][kind]["p95_ms"] for run in runs])
+        lines.append(f"{kind}: exponent {fit.exponent:.2f}, so {fit(MANY):.0f} ms at 10⁸ events")
+    return ["By a power law through these figures, which is a guess beyond the last of them:", tuple(lines)]
+
+
+def real_time_per_s(sites: int) -> float:
+    """Return the messages that so many sites send in a second."""
+    return sites * MESSAGES_PER_HOUR / 3600

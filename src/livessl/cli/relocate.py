@@ -1,0 +1,152 @@
+"""`livessl relocate`: stored events by another method or calibration, answer beside answer, on all cores."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from statistics import median
+from typing import TYPE_CHECKING, Any
+
+from livessl.cli import argument, progress
+from livessl.cli.exits import FAILED, OK
+from livessl.cli.options import add_joint, add_json, add_method, add_site, import_from_here, read_site
+from livessl.cli.output import complain, xyz
+from livessl.errors import UseError
+
+if TYPE_CHECKING:
+    from livessl.server.clips.folder import ClipReader
+    from livessl.site.models import Site
+
+
+def add_arguments(parser: Any) -> None:
+    """Describe the command's arguments."""
+    add = parser.add_argument
+    add("clips", type=Path, nargs="?", help="folder of clips (default: that of server.clips in the site file)")
+    add_site(parser)
+    add_method(parser)
+    add_joint(parser)
+    add(
+        "--set-up",
+        choices=("then", "now"),
+        default="then",
+        help="poses and speed of sound: those by which each event was located, or those of the site file with its "
+        "calibration (default: then)",
+    )
+    add("--since", type=argument.time, metavar="TIME", help="only events that began then or later (RFC 3339)")
+    add("--until", type=argument.time, metavar="TIME", help="only events that began then or earlier (RFC 3339)")
+    add(
+        "--out",
+        type=Path,
+        metavar="FILE",
+        help="append the answers to FILE, one JSON object a line, and leave out the events that it has already",
+    )
+    add("--jobs", type=argument.positive, default=len(os.sched_getaffinity(0)), help="processes (default: all cores)")
+    add_json(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the command."""
+    from livessl.server.clips.folder import ClipReader
+    from livessl.server.clips.relocate_many import Task, relocate_many
+
+    import_from_here()
+    site = read_site(arguments)
+    folder = _folder(arguments.clips, site)
+    task, clips = Task(site, folder, arguments.method, arguments.set_up), ClipReader(folder)
+    wanted = [name for name in clips.ids() if _is_in_span(clips, name, arguments)]
+    if not wanted:
+        complain(f"{folder}: no event of that span has recordings", kind="note")
+    distances_m: list[float] = []
+    failed = 0
+    with (
+        _answers(arguments.out, task.method, task.set_up) as (known, keep),
+        progress.counted("locating", "event") as bar,
+    ):
+        missing = [name for name in wanted if name not in known]
+        bar(len(wanted) - len(missing), len(wanted))
+        for done, found in enumerate(relocate_many(task, missing, arguments.jobs), len(wanted) - len(missing) + 1):
+            keep(found)
+            _print(found, as_json=arguments.json)
+            failed += found["again"] is None
+            distances_m += [] if found["distance_m"] is None else [found["distance_m"]]
+            bar(done, len(wanted))
+    if distances_m and not arguments.json:
+        print(
+            f"{len(distances_m)} positions: median {median(distances_m):.2f} m apart, at most {max(distances_m):.2f} m"
+        )
+    return FAILED if failed else OK
+
+
+def _folder(given: Path | None, site: Site) -> Path:
+    if given is not None:
+        return given
+    if site.server.clips is None:
+        raise UseError("relocate: expected a folder of clips, as the site file has no server.clips; name it")
+    return site.file(site.server.clips.folder)
+
+
+def _is_in_span(folder: ClipReader, event_id: str, arguments: argparse.Namespace) -> bool:
+    about = folder.about(event_id)
+    if about is None:
+        return False
+    is_after = arguments.since is None or about["start_ns"] >= arguments.since
+    return is_after and (arguments.until is None or about["start_ns"] <= arguments.until)
+
+
+@contextmanager
+def _answers(path: Path | None, method: str | None, set_up: str) -> Iterator[tuple[set[str], Any]]:
+    """Open the file of answers; yield the ids of the events that it has, and a function that appends an answer.
+
+    Raises
+    ------
+    UseError
+        If it has answers of another method or set-up, or something else.
+    """
+    if path is None:
+        yield set(), lambda _: None
+        return
+    known = set()
+    whole = 0
+    if path.exists():
+        lines = path.read_bytes().splitlines(keepends=True)
+        for line in lines:
+            if not line.endswith(b"\n"):  # a command that was killed has left it; it is written again
+                break
+            try:
+                found = json.loads(line)
+                known.add(str(found["event_id"]))
+                held = found["method"], found["set_up"]
+            except (ValueError, KeyError, TypeError) as error:
+                raise UseError(f"--out: expected answers of `livessl relocate` in {path}, got another file") from error
+            if held != (method, set_up):
+                raise UseError(f"--out: {path} has answers of --method {held[0]} --set-up {held[1]}; name another file")
+            whole += len(line)
+    with path.open("ab") as file:
+        file.truncate(whole)
+
+        def keep(found: dict[str, Any]) -> None:
+            file.write(json.dumps(found).encode() + b"\n")
+            file.flush()
+
+        yield known, keep
+
+
+def _print(found: dict[str, Any], *, as_json: bool) -> None:
+    if as_json:
+        print(json.dumps(found), flush=True)
+        return
+    stored, again = found["stored"], found["again"]
+    if again is None:
+        print(f"{found['event_id']}  {found['error']}", flush=True)
+        return
+    apart = "" if found["distance_m"] is None else f"{found['distance_m']:.2f} m apart"
+    print(f"{found['event_id']}  {_answer(stored)}  ->  {_answer(again)}  {apart}", flush=True)
+
+
+def _answer(answer: dict[str, Any]) -> str:
+    what = xyz(answer["position_m"]) if answer["status"] == "located" else answer["status"]
+    return f"{what:<22} {answer['method']} {answer['confidence']:.2f}"

@@ -1,0 +1,19 @@
+"""The service manager of a command that runs for ever."""
+
+from __future__ import annotations
+
+import faulthandler
+
+from livessl.clock import SystemClock
+from livessl.service_manager import ServiceManager
+
+
+def service_manager() -> ServiceManager:
+    """Return the service manager of the environment; call it before anything else can start a program.
+
+    A process that it watches prints where each of its threads is when it is killed by SIGABRT, as one that hangs is.
+    """
+    service = ServiceManager.of_environment(SystemClock())
+    if service.watches:
+        faulthandler.enable()
+    return service

@@ -1,0 +1,134 @@
+"""Says which shifts and turns of an array some sounds at unknown places could not have shown.
+
+Two arrays whose lines of sight to a sound still meet after one of them was moved receive nothing that contradicts the
+site file: the place of the sound, which nobody knows, explains it. How much of a fault remains visible follows from the
+slopes of the delays, with the places of the sounds eliminated and every array as free as it is in a careful set-up.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from livessl.core.commission.diagnosis import most_telling, of_sounds
+from livessl.core.commission.finding import LEAST_SOUNDS
+from livessl.core.commission.judge import COSTS, least_gain
+from livessl.core.commission.places import Delays, Microphones, PlaceSearch
+from livessl.core.commission.set_up import Known, SetUp
+from livessl.core.commission.tolerance import Fit
+from livessl.core.types import FloatArray
+
+MOST_HIDDEN_M: Final = 0.3
+MOST_HIDDEN_DEG: Final = 10.0
+"""Shift, in metres, and turn, in degrees, up to which nothing is said of what is hidden: sounds in all parts of a room
+show as much to three arrays."""
+
+SURELY: Final = 1.3
+"""Standard deviations by which a fault must exceed what is needed to be told, so that it is told nine times of ten."""
+
+
+_SAME_DEG: Final = 15.0
+_SAME_RATIO: Final = 1.1
+"""Angle between two directions, in degrees, and ratio of two sizes, below which they are taken for the same."""
+
+_LEAST_SEEN: Final = 1e-12
+"""Least growth of the deviance for each metre or degree squared, so that what nothing shows has a size at all."""
+
+
+@dataclass(frozen=True, slots=True)
+class BlindSpot:
+    """A fault of a pose that some sounds would not show.
+
+    Parameters
+    ----------
+    fault : str
+        `moved` or `turned`.
+    arrays : tuple of str
+        The array; several if the same fault of each of them would be hidden alike.
+    least : float
+        Smallest shift, in metres, or turn, in degrees, that the sounds would show in nine of ten cases.
+    along : (3,) tuple of float
+        Unit vector of the shift, or of the axis of the turn.
+    """
+
+    fault: str
+    arrays: tuple[str, ...]
+    least: float
+    along: tuple[float, ...]
+
+
+def blind_spots(
+    microphones: Microphones, delays: Delays, bounds_m: FloatArray, c_m_s: float, known: Known
+) -> tuple[BlindSpot, ...]:
+    """Return the shifts and turns that sounds at unknown places hide most, of each array.
+
+    Parameters
+    ----------
+    microphones : mapping of array to (K, 3) float64
+        As filed, metres.
+    delays : mapping of array to (S, K) float64
+        Delays of the same S sounds at each array, seconds; NaN where an array did not receive one.
+    bounds_m : (3, 2) float64
+        Search volume, metres.
+    c_m_s : float
+        Speed of sound as filed, m/s.
+    known : Known
+        How exactly the set-up and the delays are known.
+
+    Returns
+    -------
+    tuple of BlindSpot
+        Those that are larger than `MOST_HIDDEN_M` and `MOST_HIDDEN_DEG`; empty with fewer than two arrays or three
+        sounds, which show no pose at all.
+    """
+    if len(delays) < 2 or len(next(iter(delays.values()))) < LEAST_SOUNDS:
+        return ()
+    rows, microphones = most_telling(delays), {name: microphones[name] for name in delays}
+    delays, known = of_sounds(delays, rows), known.of_sounds(rows)
+    places_m = PlaceSearch(bounds_m, c_m_s).fit(microphones, delays).positions_m
+    set_up = SetUp(microphones, delays, c_m_s, known.freedom, stds_s=known.stds_s)
+    fit = Fit([set_up], places_m[None], bounds_m)
+    fit.run()
+    [seen] = fit.seen()
+    found: dict[str, list[BlindSpot]] = {"moved": [], "turned": []}
+    for name in microphones:
+        own, pose = known.freedom[name], fit.pose_of(name)
+        for fault, columns, std in (
+            ("moved", pose[:3], np.full(3, own.position_m)),
+            ("turned", pose[3:], own.orientation_deg),
+        ):
+            found[fault].append(_weakest(fault, name, seen[np.ix_(columns, columns)] / np.outer(std, std), len(delays)))
+    most = {"moved": MOST_HIDDEN_M, "turned": MOST_HIDDEN_DEG}
+    hidden = {fault: [one for one in spots if one.least > most[fault]] for fault, spots in found.items()}
+    return tuple(spot for spots in hidden.values() for spot in _joined(spots))
+
+
+def _weakest(fault: str, array: str, seen: FloatArray, arrays: int) -> BlindSpot:
+    """Return the direction that shows least of a fault, and how large the fault must be there to be told.
+
+    `seen` (3, 3) is what the deviance grows by, for each metre or degree squared.
+    """
+    needed = np.sqrt(COSTS[fault] + least_gain(arrays)) + SURELY
+    values, vectors = np.linalg.eigh(seen)
+    weakest = vectors[:, 0]
+    along = weakest * np.sign(weakest[np.abs(weakest).argmax()])
+    least = float(needed / np.sqrt(max(values[0], _LEAST_SEEN)))
+    return BlindSpot(fault, (array,), least, tuple(float(one) for one in along))
+
+
+def _joined(spots: Sequence[BlindSpot]) -> Iterator[BlindSpot]:
+    """Yield blind spots of one fault, those of several arrays joined that are one and the same."""
+    rest = list(spots)
+    while rest:
+        first = rest[0]
+        same = [one for one in rest if _is_same(one, first)]
+        yield replace(first, arrays=tuple(name for one in same for name in one.arrays))
+        rest = [one for one in rest if one not in same]
+
+
+def _is_same(one: BlindSpot, other: BlindSpot) -> bool:
+    angle_deg = np.degrees(np.arccos(min(1.0, abs(float(np.dot(one.along, other.along))))))
+    return bool(angle_deg < _SAME_DEG and max(one.least, other.least) < _SAME_RATIO * min(one.least, other.least))

@@ -1,0 +1,68 @@
+"""The contract of the API, continued: models of an event that is located again."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from livessl.core.states import Status
+from livessl.schema.base import Model
+from livessl.schema.values import ArrayNames, Candidates, Confidence, CovarianceM2, PositionM, Versioned
+
+
+class RelocateRequest(BaseModel):
+    """Request to locate an event again from its recordings."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+    method: str | None = Field(
+        default=None,
+        min_length=1,
+        max_length=200,
+        description="One of the `methods` of `GET events/{id}/clips`; null takes that of the event.",
+        examples=["srp-phat"],
+    )
+    set_up: Literal["then", "now"] = Field(
+        default="then",
+        description="Places of the microphones, and speed of sound: `then`, those by which the event was located "
+        "first, or `now`, those in force.",
+        examples=["now"],
+    )
+
+
+class LocationAnswer(Model):
+    """One answer to where an event was."""
+
+    method: str = Field(description="Name of the method.", examples=["srp-phat"])
+    status: Status
+    reason: str | None = Field(description="Why it is not simply located; null if there is nothing to explain.")
+    position_m: PositionM | None = Field(description="Position of the source; null when refused.")
+    covariance_m2: CovarianceM2 | None = Field(description="Covariance of the position; null when refused.")
+    std_m: float | None = Field(
+        ge=0,
+        description="Standard deviation in metres along the axis of largest uncertainty; null when refused.",
+        examples=[0.11],
+    )
+    confidence: Confidence
+    arrays: ArrayNames = Field(description="Arrays that contributed to the position.")
+    candidates: Candidates
+
+
+class Relocated(Versioned):
+    """Both answers to where an event was; nothing is stored."""
+
+    event_id: str = Field(description="Id of the event.", examples=["lab-35340000000"])
+    set_up: Literal["then", "now"] = Field(description="The poses that it was located with again.")
+    moved_arrays: ArrayNames = Field(
+        description="Arrays of the recordings whose microphones have other places now than when the event was located."
+    )
+    stored: LocationAnswer = Field(description="The answer in the history.")
+    again: LocationAnswer = Field(description="The answer of now.")
+    other_sources: list[LocationAnswer] = Field(
+        description="Answers for further sources of the same sound, which are events of their own in the history."
+    )
+    distance_m: float | None = Field(
+        ge=0, description="Distance between the two positions in metres; null without one of them.", examples=[0.08]
+    )
+    took_s: float = Field(ge=0, description="Time that the computation took, in seconds.", examples=[0.4])

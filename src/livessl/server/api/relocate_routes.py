@@ -1,0 +1,100 @@
+"""REST route that locates a stored event again, by another method or with the poses in force now."""
+
+from __future__ import annotations
+
+import logging
+from typing import Final
+
+from fastapi import APIRouter, HTTPException, Request, Response
+
+from livessl.errors import ConfigError
+from livessl.schema import relocation
+from livessl.schema.answers import errors
+from livessl.server.api.encode import API_VERSION, JsonObject, answer, std_m
+from livessl.server.api.queries import unprocessable
+from livessl.server.api.routes import as_json
+from livessl.server.clips.relocate import (
+    BusyError,
+    NoClipError,
+    RelocationError,
+    Relocator,
+    distance_m,
+    known_methods,
+)
+from livessl.server.parts import Parts
+
+_TEXTS: Final = {
+    404: "There is no event of that id, or it has no recordings.",
+    409: "Its recordings are still being made, or are of an earlier release; an array has changed or gone.",
+    503: "Another event is being located again, the server is overloaded, or the event database cannot be used.",
+}
+_log = logging.getLogger(__name__)
+
+
+def relocate_route(parts: Parts) -> APIRouter:
+    """Both answers beside each other."""
+    clips, router = parts.clips, APIRouter(prefix="/api/v1", tags=["clips"])
+    relocator = None
+    if clips is not None:
+        relocator = Relocator(clips.folder, parts.clock, lambda: parts.set_up.site, parts.overload)
+
+    @router.post(
+        "/events/{event_id}/relocate",
+        response_model=relocation.Relocated,
+        responses=errors(400, 404, 409, 411, 413, 503, texts=_TEXTS),
+    )
+    def post_relocate(event_id: str, wanted: relocation.RelocateRequest, request: Request) -> Response:
+        """Locate an event again from its recordings, and return both answers; stores nothing. For operators.
+
+        A thread of low priority does it, one event at a time, and none while live sound needs the whole machine.
+        """
+        stored = parts.store.get(event_id)
+        if stored is None:
+            raise HTTPException(404, f"no event {event_id!r}")
+        method = stored["method"] if wanted.method is None else wanted.method
+        known = known_methods(parts.site)
+        if method not in known:
+            raise unprocessable("method", f"method: expected one of {', '.join(known)}, got {method!r}", "body")
+        if clips is None or relocator is None:
+            raise HTTPException(404, f"event {event_id!r} has no recordings: {_why_none(parts)}")
+        if clips.is_waiting(event_id):
+            raise HTTPException(409, f"the recordings of {event_id!r} are being made; try again in some seconds")
+        try:
+            found, took_s = relocator.relocate(event_id, method, wanted.set_up)
+        except NoClipError as error:
+            raise HTTPException(404, str(error)) from error
+        except BusyError as error:
+            raise HTTPException(503, str(error)) from error
+        except RelocationError as error:
+            raise HTTPException(409, str(error)) from error
+        except ConfigError as error:  # a method of the site's own that cannot be imported any more
+            raise HTTPException(409, "; ".join(map(str, error.faults))) from error
+        _log.info("%r has located %r again by %r", request.scope["client_name"], event_id, method)
+        return as_json(
+            {
+                "v": API_VERSION,
+                "event_id": event_id,
+                "set_up": wanted.set_up,
+                "moved_arrays": list(found.moved),
+                "stored": _stored(stored),
+                "again": answer(found.event),
+                "other_sources": [answer(other) for other in found.others],
+                "distance_m": distance_m(stored["position_m"], found.event),
+                "took_s": round(took_s, 3),
+            }
+        )
+
+    return router
+
+
+def _why_none(parts: Parts) -> str:
+    if parts.site.privacy == "positions-only":
+        return "with privacy: positions-only the server stores no sound"
+    return "the site file has no server.clips; name a folder there, and later events can be located again"
+
+
+def _stored(event: JsonObject) -> JsonObject:
+    """Return the answer in the history; an earlier release may have stored it without candidates."""
+    names = ("method", "status", "reason", "position_m", "covariance_m2", "confidence", "arrays")
+    known = {name: event[name] for name in names}
+    return {**known, "std_m": std_m(event["covariance_m2"]), "candidates": event.get("candidates", [])}

@@ -1,0 +1,84 @@
+"""`livessl relocate`: stored events again, answer beside answer, resumed where it was stopped."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from cli.command_runs import Run
+from small_site import write_site
+from stored_clips import CLIPS, clipped, events, messages
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A site file beside the clips of its two events."""
+    directory = tmp_path_factory.mktemp("site")
+    clipped(directory, messages())
+    return write_site(directory, {"server.clips": CLIPS})
+
+
+def test_answers_stand_beside_each_other(run: Run, site: Path) -> None:
+    done = run("relocate", "--site", site, "--method", "srp-phat", "--jobs", "1", "--json")
+    assert (done.code, done.err) == (0, "")
+    assert [found["event_id"] for found in done.objects] == [event.id for event in events()]
+    for found, event in zip(done.objects, events(), strict=True):
+        assert event.estimate is not None
+        assert found["stored"]["position_m"] == pytest.approx(event.estimate.position_m, abs=1e-4)
+        assert (found["stored"]["method"], found["again"]["method"]) == ("onset", "srp-phat")
+        assert (found["again"]["status"], found["error"], found["set_up"]) == ("located", None, "then")
+        assert 0.0 < found["distance_m"] < 0.2
+
+
+def test_span_is_chosen_and_the_text_ends_with_the_distances(run: Run, site: Path) -> None:
+    between = "2026-01-01T00:00:01Z"
+    spans = [run("relocate", site.parent / "clips", "--site", site, "--jobs", "1", option, between)
+             for option in ("--since", "--until")]  # fmt: skip
+    told = [done.out.splitlines() for done in spans]
+    assert [lines[0].split()[0] for lines in told] == [event.id for event in events()[::-1]]
+    for done, (line, last) in zip(spans, told, strict=True):
+        assert done.code == 0
+        assert line.count("onset") == 2
+        assert last.startswith("1 positions: median 0.00 m apart")
+    nothing = run("relocate", "--site", site, "--since", "2027-01-01T00:00:00Z")
+    assert (nothing.code, nothing.out) == (0, "")
+    assert "no event of that span has recordings" in nothing.err
+
+
+def test_second_run_goes_on_where_the_first_was_killed(run: Run, site: Path, tmp_path: Path) -> None:
+    out = tmp_path / "answers.jsonl"
+    common = ("relocate", "--site", site, "--method", "srp-phat", "--out", out)
+    assert run(*common, "--jobs", "2").code == 0  # by two processes
+    whole = out.read_bytes().splitlines(keepends=True)
+    assert {json.loads(line)["event_id"] for line in whole} == {event.id for event in events()}
+    out.write_bytes(whole[0] + whole[1][: len(whole[1]) // 2])  # killed while it wrote the second one
+    done = run(*common, "--jobs", "1", "--json")
+    assert [found["event_id"] for found in done.objects] == [json.loads(whole[1])["event_id"]]
+    assert out.read_bytes().splitlines(keepends=True)[0] == whole[0]
+    assert len(out.read_bytes().splitlines()) == 2
+    assert run(*common, "--json").out == ""
+    other = run("relocate", "--site", site, "--method", "averaged", "--out", out)
+    assert other.code == 2
+    assert "has answers of --method srp-phat --set-up then; name another file" in other.err
+    out.write_text("{}\n")
+    assert "expected answers of `livessl relocate`" in run(*common).err
+
+
+def test_what_cannot_be_located_again_is_told(run: Run, tmp_path: Path) -> None:
+    clipped(tmp_path, messages())
+    first = events()[0].id
+    (tmp_path / "clips" / first / "array-north.flac").unlink()
+    (tmp_path / "clips" / ".partial-x").mkdir()
+    site = write_site(tmp_path)
+    done = run("relocate", tmp_path / "clips", "--site", site, "--jobs", "1", "--json")
+    assert (done.code, len(done.objects)) == (1, 2)
+    assert "its recording 'array-north.flac' is gone" in done.objects[0]["error"]
+    assert (done.objects[0]["again"], done.objects[1]["error"]) == (None, None)
+    without = run("relocate", "--site", site)
+    assert without.code == 2
+    assert "expected a folder of clips, as the site file has no server.clips; name it" in without.err
+    missing = run("relocate", tmp_path / "nowhere", "--site", site)
+    assert missing.code == 1
+    assert "expected a folder of clips: No such file or directory; name it" in missing.err

@@ -1,0 +1,172 @@
+"""Stored events are located again from their recordings: by a real server, and what it says where it cannot."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Literal
+
+import httpx
+import numpy as np
+import pytest
+
+from livessl.core.stream.load_policy import LoadPolicy
+from livessl.server.app import Server
+from livessl.server.clips import relocate as relocation
+from livessl.server.overload import Overload
+from livessl.site.tokens import add_token
+from messages import event_message
+from scene_server import capture_scene
+from small_site import HANG_S, Changes, running_server, scene, site_of, wait_until
+
+CLIPS: Changes = {"server.clips": {"folder": "clips", "enhanced": False}, "server.http.tokens": "tokens.yaml"}
+ROLES: tuple[Literal["viewer", "operator"], ...] = ("viewer", "operator")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _patient() -> Iterator[None]:
+    """The server sheds nothing, however busy the machine is."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(LoadPolicy, "note", lambda *_: 0)
+        yield
+
+
+class Desk:
+    """A server whose clips are stored, and clients of it."""
+
+    def __init__(self, server: Server, directory: Path, tokens: dict[str, str]) -> None:
+        self.server = server
+        self.folder = directory / "clips"
+        self._tokens = tokens
+
+    def ask(self, method: str, path: str, body: Any = None, role: str = "operator") -> httpx.Response:
+        headers = {"Authorization": f"Bearer {self._tokens[role]}"}
+        return httpx.request(method, f"{self.server.url}/api/v1/{path}", headers=headers, json=body, timeout=100)
+
+    def events(self) -> list[dict[str, Any]]:
+        """All events, oldest first."""
+        found: list[dict[str, Any]] = self.ask("GET", "events").json()["events"]
+        return found[::-1]
+
+    def relocate(self, event_id: str, /, **wanted: Any) -> dict[str, Any]:
+        answer = self.ask("POST", f"events/{event_id}/relocate", wanted)
+        assert answer.status_code == 200, answer.text
+        found: dict[str, Any] = answer.json()
+        return found
+
+    def refusal(self, status: int, event_id: str, /, **wanted: Any) -> str:
+        answer = self.ask("POST", f"events/{event_id}/relocate", wanted)
+        assert answer.status_code == status, answer.text
+        return json.dumps(answer.json()["detail"])
+
+
+@pytest.fixture(scope="module")
+def desk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Desk]:
+    directory = tmp_path_factory.mktemp("site")
+    tokens: dict[str, str] = {role: add_token(directory / "tokens.yaml", role, role) for role in ROLES}
+    with running_server(site_of(CLIPS, directory)) as server:
+        capture_scene(server)
+        clips = server.parts.clips
+        assert clips is not None
+        wait_until(lambda: clips.counts.written == 2, "both clips")
+        yield Desk(server, directory, tokens)
+
+
+def test_answers_stand_beside_each_other(desk: Desk) -> None:
+    known = ["onset", "srp-phat", "cepstral", "averaged"]
+    for event, source in zip(desk.events(), scene().sources, strict=True):
+        assert desk.ask("GET", f"events/{event['id']}/clips", role="viewer").json()["methods"] == known
+        found = desk.relocate(event["id"], method="srp-phat")
+        stored, again = found["stored"], found["again"]
+        for name in ("method", "status", "reason", "position_m", "covariance_m2", "confidence", "arrays", "candidates"):
+            assert stored[name] == event[name]
+        assert (stored["method"], again["method"], again["status"]) == ("onset", "srp-phat", "located")
+        assert again["arrays"] == ["north", "south"]
+        assert np.linalg.norm(np.subtract(again["position_m"], source.position_m)) < 0.2
+        apart_m = np.linalg.norm(np.subtract(again["position_m"], event["position_m"]))
+        assert found["distance_m"] == pytest.approx(apart_m, abs=2e-3)
+        for answer in (stored, again):
+            assert answer["std_m"] == pytest.approx(np.linalg.norm(answer["covariance_m2"], 2) ** 0.5, abs=1e-3)
+
+
+def test_event_stays_as_it_is(desk: Desk) -> None:
+    before = desk.events()
+    found = desk.relocate(before[0]["id"])  # by its own method, with the poses of then
+    assert (found["again"]["method"], found["set_up"], found["moved_arrays"]) == ("onset", "then", [])
+    assert found["distance_m"] < 0.01
+    assert desk.relocate(before[0]["id"], set_up="now")["set_up"] == "now"
+    assert desk.events() == before
+
+
+def test_what_cannot_be_is_refused(desk: Desk) -> None:
+    event = desk.events()[0]["id"]
+    assert "no event 'nothing'" in desk.refusal(404, "nothing")
+    refusal = desk.refusal(422, event, method="os:system")
+    assert "expected one of onset, srp-phat, cepstral, averaged, got 'os:system'" in refusal
+    assert "then" in desk.refusal(422, event, set_up="tomorrow")
+    assert "extra_forbidden" in desk.refusal(422, event, methods=["onset"])
+    assert desk.ask("POST", f"events/{event}/relocate", {}, "viewer").status_code == 403
+
+
+def test_one_event_at_a_time(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    event = desk.events()[0]["id"]
+    begun, may_end = threading.Event(), threading.Event()
+    usual = relocation.relocate
+
+    def slow(*wanted: Any) -> relocation.Relocation:
+        begun.set()
+        assert may_end.wait(HANG_S)
+        return usual(*wanted)
+
+    monkeypatch.setattr(relocation, "relocate", slow)
+    answers: list[dict[str, Any]] = []
+    first = threading.Thread(target=lambda: answers.append(desk.relocate(event)))
+    first.start()
+    assert begun.wait(HANG_S)
+    assert "another event is being located again; try again in some seconds" in desk.refusal(503, event)
+    may_end.set()
+    first.join(HANG_S)
+    assert [answer["event_id"] for answer in answers] == [event]
+    monkeypatch.undo()
+    assert desk.relocate(event)["event_id"] == event
+
+
+def test_live_sound_comes_first(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Overload, "message", "behind")
+    refusal = desk.refusal(503, desk.events()[0]["id"])
+    assert "the server is overloaded, and live sound comes first; try again when it is not" in refusal
+
+
+def test_recordings_that_are_made_or_gone_are_told_apart(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    event = desk.events()[1]["id"]
+    clips = desk.server.parts.clips
+    assert clips is not None
+    shutil.copytree(desk.folder / event, tmp_path / event)
+    with monkeypatch.context() as patch:
+        patch.setattr(clips, "is_waiting", lambda _: True)
+        assert "are being made; try again in some seconds" in desk.refusal(409, event)
+    (desk.folder / event / "array-north.flac").write_bytes(b"")
+    assert "array-north.flac cannot be read" in desk.refusal(409, event)
+    assert desk.ask("DELETE", f"events/{event}/clips").status_code == 200
+    assert "has no recordings; it cannot be located again without its sound" in desk.refusal(404, event)
+    assert desk.ask("GET", f"events/{event}/clips").json()["methods"] == []
+    (tmp_path / event).rename(desk.folder / event)  # for the other tests
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        ({}, "the site file has no server.clips; name a folder there"),
+        ({"privacy": "positions-only"}, "with privacy: positions-only the server stores no sound"),
+    ],
+)
+def test_server_without_sound_says_why(changes: Changes, why: str) -> None:
+    with running_server(site_of(changes)) as server:
+        server.parts.store.add(event_message(id="small-1"), 1)
+        answer = httpx.post(f"{server.url}/api/v1/events/small-1/relocate", json={})
+        assert (answer.status_code, why in answer.json()["detail"]) == (404, True)

@@ -1,0 +1,358 @@
+"""Reports to a service manager: what is sent when, and a real systemd that acts on them."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from itertools import pairwise
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from threading import Event as Flag
+
+import httpx
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from conftest import require
+from hub_desk import make_hub, running_hub
+from livessl.clock import SystemClock, UnpacedClock
+from livessl.lab.processes import free_port
+from livessl.server.engine import Engine
+from livessl.server.sign_of_life import SignOfLife
+from livessl.service_manager import MAX_STATUS, SIGNS, STATUS_NS, ServiceManager
+from notify_socket import NotifySocket, listening
+from small_site import HANG_S, running_server, site_of, wait_until, write_site
+
+ROOT = Path(__file__).parents[1]
+SYSTEMD = Path("/usr/lib/systemd/systemd")
+UNIT = ROOT / "deploy" / "livessl-server.service"
+
+SANDBOX = ("Protect", "Private", "User=", "DynamicUser=", "NoNewPrivileges=", "CapabilityBoundingSet=", "Restrict",
+           "LockPersonality=", "SystemCall", "WorkingDirectory=", "Environment=", "ExecReload=/opt")  # fmt: skip
+"""Settings of the unit that a service manager of one user cannot apply."""
+
+
+class SteppedClock(UnpacedClock):
+    """A clock that goes only when it is told to."""
+
+    passed_ns = 0
+
+    def monotonic_ns(self) -> int:
+        return self.passed_ns
+
+
+@given(
+    silence_ms=st.integers(100, 60_000),
+    steps=st.lists(st.tuples(st.integers(0, 300), st.sampled_from(["", "ok", "a\nb", "x" * 900])), min_size=1),
+)
+def test_loop_that_turns_is_never_silent_for_long_and_says_nothing_twice(
+    silence_ms: int, steps: list[tuple[int, str]]
+) -> None:
+    """Steps are of at most 0.3 of the longest silence, as those of a loop that is far from hanging."""
+    with TemporaryDirectory() as folder, listening(Path(folder)) as manager:
+        clock, silence_ns = SteppedClock(), silence_ms * 1_000_000
+        service = ServiceManager(clock, manager.address, silence_ns)
+        signs_ns: list[int] = []
+        looks_ns: list[int] = []
+        shown = ""
+        for permille, status in steps:
+            clock.passed_ns += silence_ns * permille // 1000
+
+            def describe(status: str = status) -> str:
+                looks_ns.append(clock.passed_ns)
+                return status
+
+            before = len(manager.said)
+            service.turn(describe)
+            new = manager.said[before:]
+            signs_ns += [clock.passed_ns] * new.count("WATCHDOG=1")
+            for line in new:
+                if line.startswith("STATUS="):
+                    assert line != f"STATUS={shown}"
+                    shown = line.removeprefix("STATUS=")
+                    assert shown == status.replace("\n", " ")[:MAX_STATUS]
+        assert manager.said[0] == "READY=1"
+        assert manager.count("READY=1") == 1
+        assert signs_ns[0] == silence_ns * steps[0][0] // 1000, "the first turn is a sign of life"
+        gaps_ns = [later - sooner for sooner, later in pairwise(signs_ns)]
+        assert all(silence_ns // SIGNS <= gap <= silence_ns * 0.56 for gap in gaps_ns)  # 1/4, and a step of 0.3
+        assert all(later - sooner >= STATUS_NS for sooner, later in pairwise(looks_ns))
+
+
+def test_without_a_limit_no_signs_of_life_are_sent(tmp_path: Path) -> None:
+    with listening(tmp_path) as manager:
+        service = ServiceManager(SystemClock(), manager.address)
+        for _ in range(3):
+            service.turn(lambda: "ok")
+        assert manager.said == ["READY=1", "STATUS=ok"]
+        assert not service.watches
+
+
+def test_environment_names_the_manager_and_keeps_nothing_for_programs_that_are_started() -> None:
+    manager = NotifySocket(f"@livessl-{os.getpid()}")
+    try:
+        environment = {"NOTIFY_SOCKET": manager.address, "WATCHDOG_USEC": "4000000", "PATH": "/bin"}
+        service = ServiceManager.of_environment(SteppedClock(), environment)
+        assert environment == {"PATH": "/bin"}
+        assert service.watches
+        service.turn(lambda: "")
+        assert manager.said == ["READY=1", "WATCHDOG=1"]
+    finally:
+        manager.close()
+
+
+@pytest.mark.parametrize(
+    "environment",
+    [
+        {},
+        {"WATCHDOG_USEC": "4000000"},
+        {"NOTIFY_SOCKET": "", "WATCHDOG_USEC": "4000000"},
+        {"NOTIFY_SOCKET": "/none", "WATCHDOG_USEC": "4000000", "WATCHDOG_PID": str(os.getpid() + 1)},
+        {"NOTIFY_SOCKET": "/none", "WATCHDOG_USEC": "soon"},
+        {"NOTIFY_SOCKET": "/none", "WATCHDOG_USEC": "0"},
+    ],
+)
+def test_process_that_nobody_watches_knows_it(environment: dict[str, str]) -> None:
+    assert not ServiceManager.of_environment(SystemClock(), environment).watches
+
+
+def test_report_that_cannot_be_sent_is_logged_once_and_sent_later(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    clock = SteppedClock()
+    service = ServiceManager(clock, str(tmp_path / "notify"), 4_000_000_000)
+    for _ in range(3):
+        service.turn(lambda: "ok")
+        clock.passed_ns += STATUS_NS
+    assert len(caplog.messages) == 1
+    assert f"NOTIFY_SOCKET: cannot report to the service manager at {tmp_path}/notify" in caplog.text
+    with listening(tmp_path) as manager:
+        service.turn(lambda: "ok")
+        assert manager.said == ["READY=1", "WATCHDOG=1", "STATUS=ok"]
+
+
+def test_manager_that_reads_nothing_holds_nobody_up(tmp_path: Path) -> None:
+    """Its socket is full soon; the reports come when it reads again."""
+    with listening(tmp_path) as manager:
+        clock = SteppedClock()
+        service = ServiceManager(clock, manager.address, 4_000_000_000)
+        for _ in range(2000):
+            clock.passed_ns += 1_000_000_000
+            service.turn(lambda: "ok")
+        assert 0 < manager.count("WATCHDOG=1") < 2000
+        clock.passed_ns += 1_000_000_000
+        before = manager.count("WATCHDOG=1")
+        service.turn(lambda: "ok")
+        assert manager.count("WATCHDOG=1") == before + 1
+
+
+def test_reload_is_reported_only_once_the_process_is_ready_and_nothing_after_its_end(tmp_path: Path) -> None:
+    with listening(tmp_path) as manager:
+        clock = SteppedClock()
+        service = ServiceManager(clock, manager.address)
+        with service.reloading():
+            pass
+        assert manager.said == []
+        service.turn(lambda: "ok")
+        clock.passed_ns = 7_123_456
+        with service.reloading():
+            assert manager.said[2:] == ["RELOADING=1", "MONOTONIC_USEC=7123"]
+        assert manager.said[4:] == ["READY=1"]
+        service.stopping()
+        service.stopping()
+        service.turn(lambda: "late")
+        assert manager.said[5:] == ["STOPPING=1", "STATUS=stopping"]
+
+
+def test_process_that_is_watched_shows_where_it_hangs(tmp_path: Path) -> None:
+    """By the same call as the commands: a process that is killed by SIGABRT prints the stacks of its threads."""
+    hangs = "from livessl.cli.service import service_manager as s; import time; s(); print(flush=True)\ntime.sleep(100)"
+    with listening(tmp_path) as manager:
+        process = subprocess.Popen(
+            [sys.executable, "-c", hangs],
+            env=manager.environment(30),
+            text=True,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+        )
+        assert process.stdout is not None
+        process.stdout.readline()
+        process.send_signal(signal.SIGABRT)
+        _, said = process.communicate(timeout=HANG_S)
+    assert process.returncode == -signal.SIGABRT
+    assert "Fatal Python error: Aborted" in said
+    assert 'File "<string>", line ' in said
+
+
+class Fusion:
+    """Makes the fusion thread of servers hang, and counts how often their event loops look at it."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        turn, give = Engine.turn, SignOfLife.give
+        self.hangs, self.looks = Flag(), 0
+        self._goes_on = Flag()
+        self._goes_on.set()
+
+        def turn_or_hang(engine: Engine) -> None:
+            if not self._goes_on.is_set():
+                self.hangs.set()
+                self._goes_on.wait(HANG_S)
+            turn(engine)
+
+        def counted(sign: SignOfLife) -> None:
+            give(sign)
+            self.looks += 1
+
+        monkeypatch.setattr(Engine, "turn", turn_or_hang)
+        monkeypatch.setattr(SignOfLife, "give", counted)
+
+    def hang(self) -> None:
+        """Return when the thread hangs, and the loop has seen all of its turns."""
+        self._goes_on.clear()
+        assert self.hangs.wait(HANG_S)
+        self.wait_for_looks()
+
+    def go_on(self) -> None:
+        self._goes_on.set()
+
+    def wait_for_looks(self) -> None:
+        """Return after some more looks of the event loop."""
+        before = self.looks
+        wait_until(lambda: self.looks > before + 3, "looks at the fusion")
+
+
+def test_hung_fusion_gives_no_sign_of_life_although_http_answers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fusion = Fusion(monkeypatch)
+    with listening(tmp_path, reads=True) as manager:
+        service = ServiceManager(SystemClock(), manager.address, 4_000)  # every look at a turn is a sign of life
+        with running_server(site_of(), service=service) as server:
+            wait_until(lambda: manager.count("WATCHDOG=1") > 1, "signs of life")
+            assert manager.said[0] == "READY=1"
+            assert any(line.startswith("STATUS=starting: north: ") for line in manager.said)
+            fusion.hang()
+            before = manager.count("WATCHDOG=1")
+            fusion.wait_for_looks()
+            assert httpx.get(f"{server.url}/api/v1/health", timeout=HANG_S).status_code == 200
+            assert manager.count("WATCHDOG=1") == before
+            fusion.go_on()
+            wait_until(lambda: manager.count("WATCHDOG=1") > before, "a sign of life again")
+        assert manager.said[-2:] == ["STOPPING=1", "STATUS=stopping"]
+
+
+def test_hub_is_ready_when_it_serves_and_says_what_it_waits_for(tmp_path: Path) -> None:
+    hub = make_hub("hub.sqlite", [f"nats://127.0.0.1:{free_port()}"], tmp_path)
+    with listening(tmp_path, reads=True) as manager:
+        service = ServiceManager(SystemClock(), manager.address, 4_000)
+        with running_hub(hub, service) as server:
+            wait_until(lambda: manager.count("WATCHDOG=1") > 1, "signs of life")
+            assert manager.said[0] == "READY=1"
+            assert httpx.get(f"{server.url}/api/v1/health", timeout=HANG_S).status_code == 200
+            wait_until(lambda: any(line.startswith("STATUS=nats: ") for line in manager.said), "the problem")
+        assert manager.said[-2:] == ["STOPPING=1", "STATUS=stopping"]
+
+
+HANGING = """\
+import sys
+import time
+from pathlib import Path
+
+from livessl.cli.main import main
+from livessl.server.engine import Engine
+
+wanted, turn = Path(sys.argv.pop(1)), Engine.turn
+
+
+def turn_or_hang(engine):
+    while wanted.exists():
+        time.sleep(0.05)
+    turn(engine)
+
+
+Engine.turn = turn_or_hang
+sys.exit(main())
+"""
+"""A server whose fusion hangs as long as a file exists."""
+
+
+class Systemd:
+    """A real service manager, as one user's, that runs one unit in namespaces of its own."""
+
+    def __init__(self, folder: Path, unit: str) -> None:
+        self.log = folder / "systemd.log"
+        (folder / "run.service").write_text(unit, encoding="utf-8")
+        script = (
+            "mount -t tmpfs tmpfs /run && mkdir -p -m 700 /run/systemd/system /run/user/systemd/user && "
+            f"cp {folder}/run.service /run/user/systemd/user/ && export XDG_RUNTIME_DIR=/run/user HOME={folder} && "
+            f"{SYSTEMD} --user --unit=run.service & wait"
+        )
+        command = ("unshare", "--mount", "--pid", "--fork", "--kill-child", "--mount-proc", "sh", "-c", script)
+        with self.log.open("wb") as log:
+            self._process = subprocess.Popen(command, stdout=log, stderr=log)
+
+    def __enter__(self) -> Systemd:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._process.kill()  # and with it everything in its namespace
+        self._process.wait(timeout=HANG_S)
+
+    def control(self, *arguments: str) -> str:
+        """Return what systemctl prints, nothing as long as it cannot connect."""
+        children = Path(f"/proc/{self._process.pid}/task/{self._process.pid}/children").read_text().split()
+        if not children:
+            return ""
+        inside = ("nsenter", f"--target={children[0]}", "--mount", "--pid", "env", "XDG_RUNTIME_DIR=/run/user")
+        done = subprocess.run(
+            [*inside, "systemctl", "--user", *arguments, "run.service"], capture_output=True, text=True, check=False
+        )
+        return done.stdout
+
+    def shows(self, **wanted: str) -> bool:
+        """Whether properties of the unit begin with these texts."""
+        time.sleep(0.1)  # a look costs a process
+        properties = ",".join(wanted)
+        shown = dict(line.split("=", 1) for line in self.control("show", f"--property={properties}").splitlines())
+        return all(shown.get(name, "").startswith(value) for name, value in wanted.items())
+
+
+def user_unit(folder: Path, site: Path) -> str:
+    """Return the server's unit with a server that may hang, as one user may run it."""
+    text = UNIT.read_text(encoding="utf-8")
+    kept = "\n".join(line for line in text.splitlines() if not line.startswith(SANDBOX))
+    program = f"{sys.executable} {folder}/hanging.py {folder}/hang"
+    started = kept.replace("/opt/livessl/bin/livessl", program).replace("/etc/livessl/site.yaml", str(site))
+    assert started.count(program) == 1
+    log = f"StandardOutput=append:{folder}/server.log\nStandardError=append:{folder}/server.log"
+    environment = "\n".join(f"Environment={name}={os.environ[name]}" for name in ("PYTHONPATH",) if name in os.environ)
+    return re.sub("WatchdogSec=.*", "WatchdogSec=6", started).replace("[Service]", f"[Service]\n{log}\n{environment}")
+
+
+@pytest.mark.processes
+def test_systemd_starts_a_server_that_hangs_again_and_learns_of_its_reload_and_end(tmp_path: Path) -> None:
+    require(SYSTEMD.exists(), "systemd is not installed")
+    may = subprocess.run(["unshare", "--mount", "--pid", "--fork", "true"], capture_output=True, check=False)
+    require(may.returncode == 0, "this user may not make namespaces")
+    (tmp_path / "hanging.py").write_text(HANGING, encoding="utf-8")
+    hang, log = tmp_path / "hang", tmp_path / "server.log"
+    with Systemd(tmp_path, user_unit(tmp_path, write_site(tmp_path))) as systemd:
+        wait_until(lambda: systemd.shows(ActiveState="active", StatusText="starting: north: "), "a ready server")
+        first = systemd.control("show", "--property=MainPID")
+        assert systemd.shows(NRestarts="0")
+        systemd.control("reload")
+        wait_until(lambda: "the site file was read again: nothing has changed" in log.read_text(), "the reload")
+        wait_until(lambda: systemd.shows(ActiveState="active", SubState="running"), "the end of the reload")
+        hang.touch()
+        wait_until(lambda: "Fatal Python error: Aborted" in log.read_text(), "the end of the server that hangs")
+        hang.unlink()
+        wait_until(lambda: systemd.shows(ActiveState="active", StatusText="starting: north: "), "the next server")
+        assert systemd.control("show", "--property=MainPID") != first
+        assert "in turn_or_hang" in log.read_text(), "the journal shows where it hung"
+        systemd.control("stop")
+        wait_until(lambda: systemd.shows(ActiveState="inactive", Result="success"), "its end")
