@@ -11,10 +11,10 @@ the maximum-likelihood weight (Knapp and Carter 1976, after Hannan and Thomson).
 averages, fails in reverberation; this one follows the precedence effect.
 
 The GCC is sum_t w conj(U_i) U_k, U = X/sqrt(P), summed over the band and *not* normalised: windows and bins with more
-evidence count more, and sums over frames give the GCC of a window or an event. `onset_weights` and
-`cross_spectra` of the kernels are the arithmetic. Where noise dominates, P is the mean power of the microphones, so that a noisy microphone counts less than its phase alone would. Where there is little
-noise, P is each microphone's own power, and only phases count: otherwise the louder of two sources would mask the
-other.
+evidence count more, and sums over frames give the GCC of a window or an event. `onset_weights` and `cross_spectra` of
+the kernels are the arithmetic. Where noise dominates, P is the mean power of the microphones, so that a noisy
+microphone counts less than its phase alone would. Where there is little noise, P is each microphone's own power, and
+only phases count: otherwise the louder of two sources would mask the other.
 
 Windows in which the noise happens to be above its mean have a little weight, and there are many of them. If the phases
 of the noise are random, their sum stays small; those of a fan add up, and outweigh the sound. The cross-spectrum of the
