@@ -88,12 +88,13 @@ def test_a_second_array_with_a_weak_peak_hardly_determines_the_distance(weak: fl
     assert replace(clear, second_array=CLEAR_PEAK_TO_RMS + more).confidence == clear.confidence
 
 
-@given(spread_m=st.floats(0.01, 1.0), more=st.floats(0.05, 1.0))
-def test_confidence_falls_with_the_spread_of_a_position(spread_m: float, more: float) -> None:
-    near = ConfidenceFeatures(0.5, 8.0, crossing_deg=60.0, second_array=3.0, spread_m=spread_m)
+@given(spread_m=st.floats(0.01, 0.2), more=st.floats(0.05, 1.0))
+def test_confidence_of_lines_falls_with_the_spread_of_a_position(spread_m: float, more: float) -> None:
+    near = ConfidenceFeatures(0.5, 8.0, spread_m=spread_m, of_lines=True)
     assert replace(near, spread_m=spread_m + more).confidence < near.confidence
-    assert replace(near, spread_m=1.0).confidence < LEAST_CONFIDENCE  # of such errors half are beyond half a metre
-    assert replace(near, spread_m=0.05).confidence > 0.95
+    assert replace(near, spread_m=0.2).confidence < LEAST_CONFIDENCE
+    assert replace(near, spread_m=0.005).confidence > 0.95
+    assert replace(near, of_lines=False).confidence > 0.95
 
 
 def test_lines_of_microphones_have_no_lines_of_sight() -> None:

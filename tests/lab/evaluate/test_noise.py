@@ -171,8 +171,8 @@ def test_a_fit_finds_the_constants_by_which_positions_were_right() -> None:
     told |= {"share": np.ones(count), "method": np.full(count, "onset"), "sound": np.full(count, CLASSES[0])}
     fit = noise_fit(told)
     assert fit.elsewhere == pytest.approx(0.1, abs=0.03)
-    used = (confidence_of._BEGINNING_FIT, confidence_of._WEAK_FIT, confidence_of._SPREAD_FIT)
-    assert (fit.beginning, fit.weak, fit.spread) == pytest.approx(used, rel=0.25)
+    used = (confidence_of._BEGINNING_FIT, confidence_of._WEAK_FIT)
+    assert (fit.beginning, fit.weak) == pytest.approx(used, rel=0.25)
     assert fit.lines_spread == pytest.approx(confidence_of._LINES_SPREAD_FIT, rel=0.25)
 
 

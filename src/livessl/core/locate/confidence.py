@@ -48,7 +48,7 @@ from some tenths of a second, and the position is where the background adds to t
 
 _BEGINNING_FIT: Final = 9.2
 """Log-odds by which a beginning that has nothing at the position lowers the confidence. This constant and the next
-three are fitted as `_BACKGROUND_FIT` is."""
+two that end in `_FIT` are fitted as `_BACKGROUND_FIT` is."""
 
 _BEGUN: Final = 0.4
 """Peak-to-RMS ratio of a beginning, relative to that of the whole sound, from which on it lacks nothing."""
@@ -57,13 +57,9 @@ _WEAK_FIT: Final = 1.5
 """Log-odds lost for each unit of the peak-to-RMS ratio by which the second array falls short of `CLEAR_PEAK_TO_RMS`,
 where lines of sight that cross determine the distance: one of them is then little better than noise."""
 
-_SPREAD_FIT: Final = 1.1
-"""Factor on the standard deviation along the position's least certain axis, so that the share of right peaks that are
-beyond `NEAR_M` is that of a normal error: reflections shift delays by more than the noise does."""
-
 _LINES_SPREAD_FIT: Final = 10.0
-"""The same where all arrays are lines: three of them give as many angles as there are coordinates, with none to
-spare."""
+"""Factor on the standard deviation along the position's least certain axis where all arrays are lines: three of them
+give as many angles as there are coordinates, with none to spare. The share of errors beyond `NEAR_M` is then normal."""
 
 _LEAST_LOG_ODDS: Final = -100.0
 """Log-odds below which a probability is 0 for every purpose; a background may be any number of times the power."""
@@ -152,9 +148,10 @@ class ConfidenceFeatures:
 
     @property
     def share_of_near_peaks(self) -> float:
-        """Share of right peaks that are nearer than `NEAR_M`, with an error that is as the covariance has it."""
-        factor = _LINES_SPREAD_FIT if self.of_lines else _SPREAD_FIT
-        return math.erf(NEAR_M / (math.sqrt(2.0) * factor * max(self.spread_m, 1e-9)))
+        """Share of right peaks that are nearer than `NEAR_M`; of other arrays than lines all are."""
+        if not self.of_lines:
+            return 1.0
+        return math.erf(NEAR_M / (math.sqrt(2.0) * _LINES_SPREAD_FIT * max(self.spread_m, 1e-9)))
 
     @property
     def weakness(self) -> float:

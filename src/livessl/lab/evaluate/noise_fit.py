@@ -32,10 +32,8 @@ class NoiseFit:
         Log-odds that a beginning costs which has nothing at the position.
     weak : float
         Log-odds that each unit costs by which the second array falls short of a clear peak.
-    spread : float
-        Factor on the standard deviation along the least certain axis.
     lines_spread : float
-        The same where all arrays are lines.
+        Factor on the standard deviation along the least certain axis where all arrays are lines.
     elsewhere : float
         Share of sounds that other sources begin, which no feature shows: without it the clear peaks of noise would
         decide the other constants.
@@ -43,14 +41,13 @@ class NoiseFit:
 
     beginning: float
     weak: float
-    spread: float
     lines_spread: float
     elsewhere: float
 
 
-_START: Final = NoiseFit(5.0, 2.0, 1.5, 3.0, 0.05)
+_START: Final = NoiseFit(5.0, 2.0, 3.0, 0.05)
 
-_BOUNDS: Final = ((0.0, 50.0), (0.0, 20.0), (0.2, 10.0), (0.2, 30.0), (0.0, 0.5))
+_BOUNDS: Final = ((0.0, 50.0), (0.0, 20.0), (0.2, 30.0), (0.0, 0.5))
 
 
 def noise_fit(columns: Columns) -> NoiseFit:
@@ -72,10 +69,10 @@ def noise_fit(columns: Columns) -> NoiseFit:
     start = np.array(astuple(_START))
 
     def cost(constants: FloatArray) -> float:
-        beginning, weak, spread, lines_spread, elsewhere = constants
+        beginning, weak, lines_spread, elsewhere = constants
         likely = scipy.special.expit(log_odds - beginning * lacking - weak * weakness) * determined
-        deviation_m = np.where(of_lines, lines_spread, spread) * spread_m
-        likely *= scipy.special.erf(NEAR_M / (np.sqrt(2.0) * deviation_m)) * (1.0 - elsewhere)
+        near = scipy.special.erf(NEAR_M / (np.sqrt(2.0) * lines_spread * spread_m))
+        likely *= np.where(of_lines, near, 1.0) * (1.0 - elsewhere)
         likely = np.clip(likely, _LEAST, 1.0 - _LEAST)
         ridge = _RIDGE * float(np.square(constants / start).sum())
         return ridge - float(np.where(right, np.log(likely), np.log1p(-likely)).sum())

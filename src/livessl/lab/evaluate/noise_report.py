@@ -110,8 +110,8 @@ def _confidence(columns: Columns) -> list[Block]:
         Table(("noise", *classes), rows),
         "By the maximum likelihood of these sounds a beginning that has nothing at the position costs log-odds of "
         f"{fit.beginning:.1f}, and a second array {fit.weak:.2f} for each unit of peak-to-RMS ratio that it falls "
-        f"short of a clear peak. The standard deviation along the least certain axis counts {fit.spread:.2f} times, "
-        f"and {fit.lines_spread:.1f} times where all arrays are lines. Another source begins "
+        "short of a clear peak. The standard deviation along the least certain axis counts "
+        f"{fit.lines_spread:.1f} times where all arrays are lines. Another source begins "
         f"{100.0 * fit.elsewhere:.0f} % of the sounds. The constants in use come from the {HALVES[0]} half.",
         Picture("reliability", "Share of sounds within 0.5 m, with its 95 % interval, against the mean confidence"),
     ]
