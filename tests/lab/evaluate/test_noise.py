@@ -163,11 +163,19 @@ def test_a_fit_finds_the_constants_by_which_positions_were_right() -> None:
     }
     whole, of_lines = np.zeros(count, dtype=np.bool_), rng.random(count) < 0.2
     confidence = [
-        ConfidenceFeatures(*row[:4], False, 1.0, row[4], None if np.isnan(row[5]) else row[5], row[6], lined).confidence
-        for *row, lined in zip(*(column.tolist() for column in drawn.values()), of_lines.tolist(), strict=True)
+        ConfidenceFeatures(
+            float(drawn["margin"][row]),
+            float(drawn["standing"][row]),
+            float(drawn["crossing_deg"][row]),
+            float(drawn["second_array"][row]),
+            beginning=None if np.isnan(drawn["beginning"][row]) else float(drawn["beginning"][row]),
+            spread_m=float(drawn["spread_m"][row]),
+            of_lines=bool(of_lines[row]),
+        ).confidence
+        for row in range(count)
     ]
     right = rng.random(count) < 0.9 * np.array(confidence)
-    told: Columns = drawn | {"whole": whole, "of_lines": of_lines, "error_m": np.where(right, 0.1, 2.0)}
+    told = drawn | {"whole": whole, "of_lines": of_lines, "error_m": np.where(right, 0.1, 2.0)}
     told |= {"share": np.ones(count), "method": np.full(count, "onset"), "sound": np.full(count, CLASSES[0])}
     fit = noise_fit(told)
     assert fit.elsewhere == pytest.approx(0.1, abs=0.03)

@@ -320,8 +320,8 @@ class Onset(MapEstimator):
         begun = None if is_wide else beginning(sound, first)
         if begun is None:
             return evidence
-        onsets = sound.onsets[begun]
-        own = self._evidence_of(array, sound, summed(onsets), _background(sound, len(onsets)))
+        parts = sound.onsets[begun]
+        own = self._evidence_of(array, sound, summed(parts), _background(sound, len(parts)))
         return replace(evidence, beginning=own)
 
     def _evidence_of(self, array: str, sound: Sound, onsets: OnsetGCC, background: Float32Array | None) -> Evidence:

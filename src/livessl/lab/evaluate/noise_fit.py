@@ -77,8 +77,7 @@ def noise_fit(columns: Columns) -> NoiseFit:
         ridge = _RIDGE * float(np.square(constants / start).sum())
         return ridge - float(np.where(right, np.log(likely), np.log1p(-likely)).sum())
 
-    options = {"maxiter": 2000, "xatol": 1e-3, "fatol": 1e-3}
-    found = scipy.optimize.minimize(cost, start, method="Nelder-Mead", bounds=_BOUNDS, options=options)
+    found = scipy.optimize.minimize(cost, start, method="Nelder-Mead", bounds=_BOUNDS, tol=1e-3)
     return NoiseFit(*(float(value) for value in found.x))
 
 
