@@ -93,8 +93,11 @@ def _is_in_span(folder: ClipReader, event_id: str, arguments: argparse.Namespace
     about = folder.about(event_id)
     if about is None:
         return False
-    is_after = arguments.since is None or about["start_ns"] >= arguments.since
-    return is_after and (arguments.until is None or about["start_ns"] <= arguments.until)
+    start_ns = about.get("start_ns")
+    if not isinstance(start_ns, int):  # damaged: it is reported as an event that cannot be located again
+        return True
+    is_after = arguments.since is None or start_ns >= arguments.since
+    return is_after and (arguments.until is None or start_ns <= arguments.until)
 
 
 @contextmanager

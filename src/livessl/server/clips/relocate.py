@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any, Final, Literal
+from typing import Final, Literal
 
 import numpy as np
-import soundfile
 
 from livessl.clock import Clock
 from livessl.core.methods import METHODS
@@ -26,10 +25,9 @@ from livessl.core.types import (
     Frame,
     Output,
     Status,
-    Uncertainty,
 )
-from livessl.errors import RunError
-from livessl.server.clips.folder import About, ClipReader
+from livessl.server.clips.folder import ClipReader
+from livessl.server.clips.stored_sound import RelocationError, StoredSound, stored_frames, stored_sound
 from livessl.server.overload import Overload
 from livessl.site.models import Site
 
@@ -44,14 +42,6 @@ SAME_M: Final = 1e-4
 
 SetUp = Literal["then", "now"]
 """The poses of the arrays, and the speed of sound: those by which the event was located, or those now in force."""
-
-
-class RelocationError(RunError):
-    """An event cannot be located again, for a reason that its text gives."""
-
-
-class NoClipError(RelocationError):
-    """The event has no recordings."""
 
 
 class BusyError(RelocationError):
@@ -85,11 +75,6 @@ def known_methods(site: Site) -> tuple[str, ...]:
     return tuple(dict.fromkeys((*METHODS, site.fusion.method)))
 
 
-def is_relocatable(about: Mapping[str, Any]) -> bool:
-    """Return whether a clip says of its frames what locating again needs."""
-    return bool(about.get("arrays"))
-
-
 def relocate(site: Site, folder: ClipReader, event_id: str, method: str, set_up: SetUp) -> Relocation:
     """Locate an event again from its clip.
 
@@ -108,23 +93,17 @@ def relocate(site: Site, folder: ClipReader, event_id: str, method: str, set_up:
     NoClipError
         If the event has no recordings.
     RelocationError
-        If the clip does not fit: an earlier release has made it, an array is no longer there, a file cannot be read, or
-        no sound of the event is in it.
+        If the clip does not fit: another release has made it, it is damaged, an array is no longer there, a file cannot
+        be read, or no sound of the event is in it.
     """
-    about = folder.about(event_id)
-    if about is None:
-        raise NoClipError(f"event {event_id!r} has no recordings; it cannot be located again without its sound")
-    if not is_relocatable(about):
-        raise RelocationError(
-            f"the recordings of {event_id!r} are of an earlier release, which did not store where frames begin; "
-            "locate them with `livessl locate --wav ARRAY=FILE`"
-        )
-    specs = _specs(site, about)
+    sound = stored_sound(folder, event_id)
+    specs = _specs(site, sound)
     moved = tuple(name for name, spec in specs.items() if _is_moved(spec, site.array(name)))
     if set_up == "then":
         processed = tuple(specs.get(spec.name, spec) for spec in site.processed)
-        site = site.model_copy(update={"processed": processed, "c_m_s": float(about["c_m_s"])})
-    sources = _sources(site, _frames(folder, event_id, about), method, about)
+        site = site.model_copy(update={"processed": processed, "c_m_s": sound.c_m_s})
+    frames = [frame for array in sound.arrays for frame in stored_frames(folder, event_id, array)]
+    sources = _sources(site, frames, method, sound)
     if not sources:
         raise RelocationError(
             f"the recordings of {event_id!r} have no active frame of it: frames are missing; see its gaps_s"
@@ -133,9 +112,9 @@ def relocate(site: Site, folder: ClipReader, event_id: str, method: str, set_up:
     return Relocation(wanted, tuple(event for event in sources if event is not wanted), moved)
 
 
-def _sources(site: Site, frames: Sequence[Frame], method: str, about: About) -> list[Event]:
+def _sources(site: Site, frames: Sequence[Frame], method: str, sound: StoredSound) -> list[Event]:
     """Return the events, one for each source, of the sound of a clip; none if it has no active frame of it."""
-    event_id, start_ns = str(about["event_id"]), int(about["start_ns"])
+    event_id, start_ns = sound.event_id, sound.start_ns
     sources = [
         event
         for event in events_of(site, frames, method)
@@ -147,7 +126,7 @@ def _sources(site: Site, frames: Sequence[Frame], method: str, about: About) -> 
     start = round(start_ns / FRAME_NS)
     quiet = [replace(frame, active=frame.active and frame.frame_index >= start) for frame in frames]
     found = events_of(site, quiet, method, reported_until=start)
-    end_ns = start_ns + round(1e9 * about["duration_s"])
+    end_ns = start_ns + round(1e9 * sound.duration_s)
     overlaps = {event.start_ns: min(event.end_ns, end_ns) - max(event.start_ns, start_ns) for event in found}
     longest = max(overlaps, key=lambda at_ns: overlaps[at_ns], default=None)
     return [event for event in found if event.start_ns == longest and overlaps[event.start_ns] > 0]
@@ -197,7 +176,7 @@ def events_of(site: Site, frames: Sequence[Frame], method: str, reported_until: 
     return [output for output in outputs if isinstance(output, Event)]
 
 
-def _specs(site: Site, about: About) -> dict[str, ArraySpec]:
+def _specs(site: Site, sound: StoredSound) -> dict[str, ArraySpec]:
     """Return the arrays of a clip as they were then, in the bands of now.
 
     Raises
@@ -207,8 +186,8 @@ def _specs(site: Site, about: About) -> dict[str, ArraySpec]:
     """
     now = {spec.name: spec for spec in site.processed}
     specs = {}
-    for name, known in about["arrays"].items():
-        microphones_m = np.array(known["microphones_m"], dtype=np.float64)
+    for array in sound.arrays:
+        name, microphones_m = array.name, array.microphones_m
         count = len(now[name].microphones_m) if name in now else 0
         if count != len(microphones_m):
             there = f"{count} microphones" if count else "no such array"
@@ -216,48 +195,12 @@ def _specs(site: Site, about: About) -> dict[str, ArraySpec]:
                 f"array {name!r}: its recording has {len(microphones_m)} channels, and the site file has {there} now; "
                 "locate the recordings with the former site file by `livessl locate`"
             )
-        specs[name] = replace(now[name], microphones_m=microphones_m, uncertainty=Uncertainty(**known["uncertainty"]))
+        specs[name] = replace(now[name], microphones_m=microphones_m, uncertainty=array.uncertainty)
     return specs
 
 
 def _is_moved(then: ArraySpec, now: ArraySpec) -> bool:
     return float(np.abs(then.microphones_m - now.microphones_m).max()) > SAME_M
-
-
-def _frames(folder: ClipReader, event_id: str, about: About) -> list[Frame]:
-    """Return all frames of a clip.
-
-    Raises
-    ------
-    NoClipError
-        If a recording has been deleted meanwhile.
-    RelocationError
-        If one cannot be read.
-    """
-    frames: list[Frame] = []
-    for file in about["files"]:
-        if file["kind"] != "array":
-            continue
-        path = folder.file(event_id, file["name"])
-        if path is None:
-            raise NoClipError(f"event {event_id!r}: its recording {file['name']!r} is gone; it cannot be located again")
-        try:
-            samples, _ = soundfile.read(path, dtype="float32", always_2d=True)
-        except (OSError, soundfile.SoundFileError) as error:
-            raise RelocationError(f"event {event_id!r}: {file['name']} cannot be read: {error}; delete it") from error
-        frames += _frames_of(file["array"], about["arrays"][file["array"]], samples.T)
-    return frames
-
-
-def _frames_of(array: str, known: Mapping[str, Any], samples: Any) -> list[Frame]:
-    rate_hz, time_ns = float(known["sample_rate_hz"]), int(known["time_ns"])
-    frames = []
-    for number, (index, begin, length, power, active, requested) in enumerate(known["frames"], 1):
-        piece = np.ascontiguousarray(samples[:, begin : begin + length])
-        at_ns = time_ns + round(1e9 * begin / rate_hz)
-        sequence = 0 if requested else number
-        frames.append(Frame(array, sequence, index, at_ns, rate_hz, piece, power, active, requested))
-    return frames
 
 
 class Relocator:

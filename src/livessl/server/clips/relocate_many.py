@@ -10,14 +10,14 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from multiprocessing import active_children, get_context, parent_process
 from pathlib import Path
-from typing import Any
 
 from threadpoolctl import threadpool_limits
 
 from livessl.errors import ConfigError
 from livessl.server.api.encode import JsonObject, answer
-from livessl.server.clips.folder import About, ClipReader
-from livessl.server.clips.relocate import RelocationError, SetUp, distance_m, relocate
+from livessl.server.clips.folder import ClipReader
+from livessl.server.clips.relocate import SetUp, distance_m, relocate
+from livessl.server.clips.stored_sound import RelocationError, stored_sound
 from livessl.site.models import Site
 
 
@@ -46,7 +46,6 @@ def relocate_one(task: Task, event_id: str) -> JsonObject:
     """Locate an event again; return both answers, or the first one and why there is no second."""
     folder = ClipReader(task.folder)
     about = folder.about(event_id) or {}
-    stored: Any = about.get("answer")
     found: JsonObject = {
         "kind": "relocation",
         "event_id": event_id,
@@ -54,14 +53,15 @@ def relocate_one(task: Task, event_id: str) -> JsonObject:
         "method": task.method,
         "set_up": task.set_up,
         "moved_arrays": [],
-        "stored": stored,
+        "stored": about.get("answer"),
         "again": None,
         "other_sources": [],
         "distance_m": None,
         "error": None,
     }
     try:
-        again = relocate(task.site, folder, event_id, task.method or _method(about), task.set_up)
+        stored = stored_sound(folder, event_id).answer
+        again = relocate(task.site, folder, event_id, task.method or stored["method"], task.set_up)
     except (RelocationError, ConfigError) as error:
         return found | {"error": str(error)}
     return found | {
@@ -119,8 +119,3 @@ def _begin(task: Task) -> None:
 
 def _relocate_sent(event_id: str) -> JsonObject:
     return relocate_one(_sent[0], event_id)
-
-
-def _method(about: About) -> str:
-    """Return the method by which an event was located; without it the clip is refused anyway."""
-    return str(about["answer"]["method"]) if "answer" in about else ""
