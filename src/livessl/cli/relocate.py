@@ -43,7 +43,7 @@ def add_arguments(parser: Any) -> None:
         "--out",
         type=Path,
         metavar="FILE",
-        help="append the answers to FILE, one JSON object a line, and leave out the events that it has a second answer for",
+        help="append the answers to FILE, one JSON object a line, and leave out the events that it has located already",
     )
     add("--jobs", type=argument.positive, default=len(os.sched_getaffinity(0)), help="processes (default: all cores)")
     add_json(parser)

@@ -40,6 +40,9 @@ STRIDE: Final = 40
 SAME_M: Final = 1e-4
 """Distance, in metres, up to which a microphone counts as being at the same place: positions are stored so exactly."""
 
+GiveWay = Callable[[], None]
+"""Is called between two steps of a long computation; raises `BusyError` to end it."""
+
 SetUp = Literal["then", "now"]
 """The poses of the arrays, and the speed of sound: those by which the event was located, or those now in force."""
 
@@ -67,6 +70,10 @@ class Relocation:
     moved: tuple[str, ...]
 
 
+def _go_on() -> None:
+    """Never end a computation."""
+
+
 def known_methods(site: Site) -> tuple[str, ...]:
     """Return the methods by which an event may be located again: those that are registered, and the site's own.
 
@@ -75,7 +82,9 @@ def known_methods(site: Site) -> tuple[str, ...]:
     return tuple(dict.fromkeys((*METHODS, site.fusion.method)))
 
 
-def relocate(site: Site, folder: ClipReader, event_id: str, method: str, set_up: SetUp) -> Relocation:
+def relocate(
+    site: Site, folder: ClipReader, event_id: str, method: str, set_up: SetUp, give_way: GiveWay = _go_on
+) -> Relocation:
     """Locate an event again from its clip.
 
     Parameters
@@ -87,6 +96,8 @@ def relocate(site: Site, folder: ClipReader, event_id: str, method: str, set_up:
     method : str
         One of `known_methods`.
     set_up : "then" or "now"
+    give_way : callable
+        Is called before each array is read and before each step of the fusion; ends it by an error.
 
     Raises
     ------
@@ -102,8 +113,11 @@ def relocate(site: Site, folder: ClipReader, event_id: str, method: str, set_up:
     if set_up == "then":
         processed = tuple(specs.get(spec.name, spec) for spec in site.processed)
         site = site.model_copy(update={"processed": processed, "c_m_s": sound.c_m_s})
-    frames = [frame for array in sound.arrays for frame in stored_frames(folder, event_id, array)]
-    sources = _sources(site, frames, method, sound)
+    frames: list[Frame] = []
+    for array in sound.arrays:
+        give_way()
+        frames += stored_frames(folder, event_id, array)
+    sources = _sources(site, frames, method, sound, give_way)
     if not sources:
         raise RelocationError(
             f"the recordings of {event_id!r} have no active frame of it: frames are missing; see its gaps_s"
@@ -112,12 +126,12 @@ def relocate(site: Site, folder: ClipReader, event_id: str, method: str, set_up:
     return Relocation(wanted, tuple(event for event in sources if event is not wanted), moved)
 
 
-def _sources(site: Site, frames: Sequence[Frame], method: str, sound: StoredSound) -> list[Event]:
+def _sources(site: Site, frames: Sequence[Frame], method: str, sound: StoredSound, give_way: GiveWay) -> list[Event]:
     """Return the events, one for each source, of the sound of a clip; none if it has no active frame of it."""
     event_id, start_ns = sound.event_id, sound.start_ns
     sources = [
         event
-        for event in events_of(site, frames, method)
+        for event in events_of(site, frames, method, give_way=give_way)
         if event_id == event.id or event_id.startswith(f"{event.id}-") or event.id.startswith(f"{event_id}-")
     ]
     if sources:
@@ -125,14 +139,16 @@ def _sources(site: Site, frames: Sequence[Frame], method: str, sound: StoredSoun
     # a part of a longer sound, which was split: what the clip has of the part before is no event of its own
     start = round(start_ns / FRAME_NS)
     quiet = [replace(frame, active=frame.active and frame.frame_index >= start) for frame in frames]
-    found = events_of(site, quiet, method, reported_until=start)
+    found = events_of(site, quiet, method, reported_until=start, give_way=give_way)
     end_ns = start_ns + round(1e9 * sound.duration_s)
     overlaps = {event.start_ns: min(event.end_ns, end_ns) - max(event.start_ns, start_ns) for event in found}
     longest = max(overlaps, key=lambda at_ns: overlaps[at_ns], default=None)
     return [event for event in found if event.start_ns == longest and overlaps[event.start_ns] > 0]
 
 
-def events_of(site: Site, frames: Sequence[Frame], method: str, reported_until: int | None = None) -> list[Event]:
+def events_of(
+    site: Site, frames: Sequence[Frame], method: str, reported_until: int | None = None, give_way: GiveWay = _go_on
+) -> list[Event]:
     """Locate the events in frames of a site's arrays, on joint frame indices, by the fusion that locates live sound.
 
     Requested frames are given only if the fusion requests them. Frames before `reported_until` are in no pre-roll.
@@ -156,11 +172,13 @@ def events_of(site: Site, frames: Sequence[Frame], method: str, reported_until: 
         fusion.set_answers(array, True)
     outputs: list[Output] = []
     while sent:
+        give_way()
         end, end_ns = sent[0].frame_index + STRIDE, (sent[0].frame_index + STRIDE + 1) * FRAME_NS
         taken = [frame for frame in sent if frame.frame_index <= end]
         sent = sent[len(taken) :]
         fresh = fusion.step(taken, end_ns, complete_until=end)
         while requests := [output for output in fresh if isinstance(output, BackfillRequest)]:
+            give_way()
             outputs += fresh
             for request in requests:  # what is not in the clip does not come any more
                 fusion.set_answers(request.array, False)
@@ -172,6 +190,7 @@ def events_of(site: Site, frames: Sequence[Frame], method: str, reported_until: 
                 fusion.set_answers(request.array, True)
         outputs += fresh
         if not sent:
+            give_way()
             outputs += fusion.flush(end_ns)
     return [output for output in outputs if isinstance(output, Event)]
 
@@ -213,7 +232,8 @@ class Relocator:
     site : callable
         Returns the site with the poses that are in force.
     overload : Overload
-        Nothing is located again while the server is overloaded.
+        Nothing is located again while the server is overloaded; a computation that runs when an overload begins ends at
+        its next step.
     """
 
     def __init__(self, folder: ClipReader, clock: Clock, site: Callable[[], Site], overload: Overload) -> None:
@@ -222,6 +242,18 @@ class Relocator:
         self._site = site
         self._overload = overload
         self._one_at_a_time = threading.Lock()
+        self._stopping = threading.Event()
+        self._ended: threading.Event | None = None  # of the computation that runs, or ran last
+
+    def stop(self) -> None:
+        """Refuse the request that waits, and all further ones; wait for nothing.
+
+        The computation that runs ends at its next step.
+        """
+        self._stopping.set()
+        ended = self._ended
+        if ended is not None:
+            ended.set()
 
     def relocate(self, event_id: str, method: str, set_up: SetUp) -> tuple[Relocation, float]:
         """Locate an event again, and wait for it, as the function does; return also how long it took, in seconds.
@@ -229,41 +261,52 @@ class Relocator:
         Raises
         ------
         BusyError
-            If another event is being located again, or the server is overloaded.
+            If another event is being located again, the server is stopping, or it is or becomes overloaded.
         NoClipError, RelocationError
             As the function.
         """
-        if self._overload.message is not None:
-            raise BusyError("the server is overloaded, and live sound comes first; try again when it is not")
+        self._give_way()
         if not self._one_at_a_time.acquire(blocking=False):  # a thread that waited would be missing for other requests
             raise BusyError("another event is being located again; try again in some seconds")
         try:
             begun_ns = self._clock.monotonic_ns()
-            made = _at_leisure(lambda: relocate(self._site(), self._folder, event_id, method, set_up))
+            made = self._at_leisure(
+                lambda: relocate(self._site(), self._folder, event_id, method, set_up, self._give_way)
+            )
             return made, (self._clock.monotonic_ns() - begun_ns) / 1e9
         finally:
             self._one_at_a_time.release()
 
+    def _give_way(self) -> None:
+        if self._stopping.is_set():
+            raise BusyError("the server is stopping; try again when it has started again")
+        if self._overload.message is not None:
+            raise BusyError("the server is overloaded, and live sound comes first; try again when it is not")
 
-def _at_leisure(work: Callable[[], Relocation]) -> Relocation:
-    """Do some work on a thread of low priority of its own, and wait for it; raise what it raises."""
-    made: list[Relocation] = []
-    failed: list[BaseException] = []
+    def _at_leisure(self, work: Callable[[], Relocation]) -> Relocation:
+        """Do some work on a thread of low priority of its own, and wait for it or for `stop`; raise what it raises."""
+        made: list[Relocation] = []
+        failed: list[BaseException] = []
+        self._ended = ended = threading.Event()
 
-    def run() -> None:
-        with suppress(OSError):  # a system that does not know priorities of threads
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)
-        try:
-            made.append(work())
-        except BaseException as error:  # noqa: BLE001 - it is raised by the thread that waits
-            failed.append(error)
+        def run() -> None:
+            with suppress(OSError):  # a system that does not know priorities of threads
+                os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)
+            try:
+                made.append(work())
+            except BaseException as error:  # noqa: BLE001 - it is raised by the thread that waits
+                failed.append(error)
+            ended.set()
 
-    thread = threading.Thread(target=run, name="relocate", daemon=True)
-    thread.start()
-    thread.join()
-    if failed:
-        raise failed[0]
-    return made[0]
+        threading.Thread(target=run, name="relocate", daemon=True).start()
+        if not self._stopping.is_set():  # `stop` may have missed the new event
+            ended.wait()
+        if made:
+            return made[0]
+        if failed:
+            raise failed[0]
+        self._give_way()
+        raise AssertionError("a computation has ended without a result")
 
 
 def distance_m(stored_m: Sequence[float] | None, again: Event) -> float | None:
