@@ -18,6 +18,7 @@ from livessl.core.stream.load_policy import LoadPolicy
 from livessl.core.types import Frame
 from livessl.server.app import Server
 from livessl.server.clips import relocate as relocation
+from livessl.server.clips.stored_sound import stored_frames
 from livessl.server.overload import Overload
 from livessl.site.tokens import add_token
 from messages import event_message
@@ -145,12 +146,11 @@ def test_live_sound_comes_first(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> 
 def blocking_frames(monkeypatch: pytest.MonkeyPatch) -> tuple[threading.Event, threading.Event]:
     """Make a relocation wait once it has read its first array; return events for that and for going on."""
     begun, may_go_on = threading.Event(), threading.Event()
-    usual = relocation.stored_frames
 
     def slow(*wanted: Any) -> list[Frame]:
         begun.set()
         assert may_go_on.wait(HANG_S)
-        return usual(*wanted)
+        return stored_frames(*wanted)
 
     monkeypatch.setattr(relocation, "stored_frames", slow)
     return begun, may_go_on
@@ -191,6 +191,24 @@ def test_relocation_in_flight_does_not_delay_the_end(
     may_go_on.set()
     hanging[0].join(HANG_S)
     assert not hanging[0].is_alive()
+
+
+def test_sound_that_would_use_up_the_memory_is_refused(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(relocation, "MOST_BYTES", 1000)
+    refusal = desk.refusal(409, desk.events()[0]["id"])
+    assert "too large for a running server" in refusal
+    assert "locate the event with `livessl relocate`" in refusal
+
+
+def test_damaged_clip_is_refused(desk: Desk) -> None:
+    event = desk.events()[0]["id"]
+    path = desk.folder / event / "clip.json"
+    whole = path.read_bytes()
+    about = json.loads(whole)
+    about["arrays"]["north"]["uncertainty"]["humidity_percent"] = 5.0
+    path.write_text(json.dumps(about))
+    assert "expected a clip.json that this release can read" in desk.refusal(409, event)
+    path.write_bytes(whole)  # for the other tests
 
 
 def test_recordings_that_are_made_or_gone_are_told_apart(

@@ -13,14 +13,21 @@ import orjson
 import pytest
 import soundfile
 
-from livessl.core.types import Event, FloatArray, Frame, Status
+from livessl.core.types import FRAME_NS, Event, FloatArray, Frame, Status
 from livessl.recordings.assign import AssignedRecording
 from livessl.recordings.recording import MemoryRecording
+from livessl.server.clips import relocate as relocation
 from livessl.server.clips.folder import ClipReader
 from livessl.server.clips.relocate import relocate
 from livessl.server.clips.relocate_many import Task, relocate_many
 from livessl.server.clips.service import Clips
-from livessl.server.clips.stored_sound import NoClipError, RelocationError
+from livessl.server.clips.stored_sound import (
+    NoClipError,
+    RelocationError,
+    check_memory,
+    stored_frames,
+    stored_sound,
+)
 from livessl.simulation.scene import make_scene, render
 from livessl.site.models import Site
 from small_site import RATE_HZ, hiss, scene, site_of
@@ -172,6 +179,8 @@ def test_clip_that_does_not_fit_says_why(tmp_path: Path) -> None:
         relocate(site, folder, second, "onset", "then")
 
 
+INDEX = START_NS // FRAME_NS
+
 DAMAGES: dict[str, tuple[str, Any, str]] = {
     "field of another release": ("arrays.north.uncertainty.humidity_percent", 3.0, "humidity_percent"),
     "no speed of sound": ("c_m_s", ..., "'c_m_s' is missing"),
@@ -183,9 +192,10 @@ DAMAGES: dict[str, tuple[str, Any, str]] = {
     "begin before the recording": ("arrays.south.frames", [[1, -2, 3, 0.1, True, False]], "a begin of 0 or more"),
     "frame beyond the recording": (
         "arrays.south.frames",
-        [[1, 10**9, 3, 0.1, True, False]],
+        [[INDEX, 10**9, 3, 0.1, True, False]],
         "expected 1000000003 samp",
     ),
+    "frame of another year": ("arrays.south.frames", [[1, 0, 3, 0.1, True, False]], "within 3600 s of the event"),
     "flat positions": (
         "arrays.south.microphones_m",
         [[1.0, 2.0]] * 4,
@@ -217,6 +227,26 @@ def test_damaged_or_future_clip_is_refused_alone(copied: Path, key: str, value: 
     damaged, whole = relocate_many(task, [first, second], 1)
     assert (damaged["again"], whole["error"], whole["again"]["status"]) == (None, None, "located")
     assert re.search(why, damaged["error"])
+
+
+def test_sound_that_takes_too_much_memory_is_refused_before_it_is_read(
+    copied: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, event = ClipReader(copied), events()[0].id
+    frames = [frame for array in stored_sound(folder, event).arrays for frame in stored_frames(folder, event, array)]
+    nbytes = sum(frame.samples.nbytes for frame in frames)
+    about = folder.about(event)
+    assert about is not None
+    whole = sum(4 * each["channels"] * round(each["sample_rate_hz"] * each["duration_s"]) for each in about["files"])
+    assert 0.5 * whole < nbytes <= whole
+    check_memory(stored_sound(folder, event), whole)
+    read: list[Any] = []
+    monkeypatch.setattr(relocation, "stored_frames", lambda *wanted: read.append(wanted))
+    with pytest.raises(
+        RelocationError, match=r"expected at most \d+ MB of decoded samples, got \d+ MB; locate the event"
+    ):
+        relocate(site_of(), folder, event, "onset", "then", most_bytes=nbytes - 1)
+    assert read == []
 
 
 def test_recording_of_other_channels_is_refused(copied: Path) -> None:

@@ -19,7 +19,7 @@ from livessl.server.parts import Parts
 
 _TEXTS: Final = {
     404: "There is no event of that id, or it has no recordings.",
-    409: "Its recordings are still being made, or are damaged or of another release; an array has changed or gone.",
+    409: "Its recordings are still being made, damaged, too large or of another release; an array has changed or gone.",
     503: "Another event is being located again, the server is overloaded or stopping, or the database cannot be used.",
 }
 _log = logging.getLogger(__name__)

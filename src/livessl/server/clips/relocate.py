@@ -27,7 +27,14 @@ from livessl.core.types import (
     Status,
 )
 from livessl.server.clips.folder import ClipReader
-from livessl.server.clips.stored_sound import RelocationError, StoredSound, stored_frames, stored_sound
+from livessl.server.clips.stored_sound import (
+    MOST_BYTES,
+    RelocationError,
+    StoredSound,
+    check_memory,
+    stored_frames,
+    stored_sound,
+)
 from livessl.server.overload import Overload
 from livessl.site.models import Site
 
@@ -83,7 +90,13 @@ def known_methods(site: Site) -> tuple[str, ...]:
 
 
 def relocate(
-    site: Site, folder: ClipReader, event_id: str, method: str, set_up: SetUp, give_way: GiveWay = _go_on
+    site: Site,
+    folder: ClipReader,
+    event_id: str,
+    method: str,
+    set_up: SetUp,
+    give_way: GiveWay = _go_on,
+    most_bytes: int | None = None,
 ) -> Relocation:
     """Locate an event again from its clip.
 
@@ -98,6 +111,8 @@ def relocate(
     set_up : "then" or "now"
     give_way : callable
         Is called before each array is read and before each step of the fusion; ends it by an error.
+    most_bytes : int or None
+        Most bytes of decoded samples; None for no limit.
 
     Raises
     ------
@@ -105,9 +120,11 @@ def relocate(
         If the event has no recordings.
     RelocationError
         If the clip does not fit: another release has made it, it is damaged, an array is no longer there, a file cannot
-        be read, or no sound of the event is in it.
+        be read, it takes more than `most_bytes`, or no sound of the event is in it.
     """
     sound = stored_sound(folder, event_id)
+    if most_bytes is not None:
+        check_memory(sound, most_bytes)
     specs = _specs(site, sound)
     moved = tuple(name for name, spec in specs.items() if _is_moved(spec, site.array(name)))
     if set_up == "then":
@@ -271,7 +288,7 @@ class Relocator:
         try:
             begun_ns = self._clock.monotonic_ns()
             made = self._at_leisure(
-                lambda: relocate(self._site(), self._folder, event_id, method, set_up, self._give_way)
+                lambda: relocate(self._site(), self._folder, event_id, method, set_up, self._give_way, MOST_BYTES)
             )
             return made, (self._clock.monotonic_ns() - begun_ns) / 1e9
         finally:

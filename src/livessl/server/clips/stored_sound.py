@@ -5,6 +5,7 @@ Nothing in `clip.json` is relied on before it is checked: another release may ha
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,9 +14,17 @@ from typing import Any, Final
 import numpy as np
 import soundfile
 
-from livessl.core.types import Float32Array, FloatArray, Frame, Uncertainty
+from livessl.core.types import FRAME_NS, Float32Array, FloatArray, Frame, Uncertainty
 from livessl.errors import RunError
 from livessl.server.clips.folder import ABOUT, ClipReader
+
+MOST_BYTES: Final = 256_000_000
+"""Most bytes of decoded samples that a server holds to locate one event again. A sound of 60 s, the longest event, at
+48 kHz from five arrays of four microphones takes 230 MB; a server whose memory is used up loses live sound."""
+
+MOST_OFF_S: Final = 3600.0
+"""Largest distance, in seconds, between the event and a frame of its clip; the fusion steps through all frame indices
+between, so that one damaged index would never end."""
 
 _UNREADABLE: Final = (AttributeError, KeyError, OverflowError, TypeError, ValueError)
 """Errors that reading a `clip.json` of another form raises."""
@@ -66,6 +75,12 @@ class StoredArray:
     time_ns: int
     sample_rate_hz: float
     rows: tuple[FrameRow, ...]
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the samples when they are decoded, as the frames hold them or as the recording does."""
+        held = max(self.length, sum(row.length for row in self.rows))
+        return held * len(self.microphones_m) * np.dtype(np.float32).itemsize
 
     @property
     def length(self) -> int:
@@ -131,6 +146,22 @@ def stored_sound(folder: ClipReader, event_id: str) -> StoredSound:
         ) from error
 
 
+def check_memory(sound: StoredSound, most_bytes: int) -> None:
+    """Refuse a sound whose decoded samples take more than a number of bytes; reads no recording.
+
+    Raises
+    ------
+    RelocationError
+    """
+    nbytes = sum(array.nbytes for array in sound.arrays)
+    if nbytes > most_bytes:
+        raise RelocationError(
+            f"the recordings of {sound.event_id!r} are too large for a running server: expected at most "
+            f"{most_bytes / 1e6:.0f} MB of decoded samples, got {math.ceil(nbytes / 1e6)} MB; locate the event with "
+            "`livessl relocate`, on a machine with the memory"
+        )
+
+
 def stored_frames(folder: ClipReader, event_id: str, array: StoredArray) -> list[Frame]:
     """Return the frames of one array of a clip.
 
@@ -192,7 +223,7 @@ def _parsed(about: Mapping[str, Any]) -> StoredSound:
     """Return the content of a `clip.json`; raises one of `_UNREADABLE` if something is missing or has another form."""
     files = {str(each["array"]): str(each["name"]) for each in about["files"] if each["kind"] == "array"}
     arrays = about["arrays"]
-    return StoredSound(
+    found = StoredSound(
         str(about["event_id"]),
         int(about["start_ns"]),
         _positive("duration_s", about["duration_s"]),
@@ -200,6 +231,15 @@ def _parsed(about: Mapping[str, Any]) -> StoredSound:
         _answer(about["answer"]),
         tuple(_array(str(name), known, files[name]) for name, known in arrays.items()),
     )
+    for array in found.arrays:
+        for row in array.rows:
+            off_s = (row.frame_index * FRAME_NS - found.start_ns) / 1e9
+            if abs(off_s) > MOST_OFF_S:
+                raise ValueError(
+                    f"arrays.{array.name}.frames: expected frames within {MOST_OFF_S:.0f} s of the event, "
+                    f"got one {off_s:.0f} s from it"
+                )
+    return found
 
 
 def _answer(answer: Mapping[str, Any]) -> Mapping[str, Any]:
