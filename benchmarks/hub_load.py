@@ -36,7 +36,7 @@ from history import Times
 from history_rows import Rows, fill
 from hub_processes import World, measure_answers, running_hub_process
 from hub_report import document, written_into
-from hub_sites import MESSAGES_PER_HOUR, SimulatedSite, hub_rows
+from hub_sites import MESSAGES_PER_HOUR, MIN_PACE, SimulatedSite, hub_rows
 from livessl.clock import SystemClock
 from livessl.federation.archive import Archive
 from livessl.federation.storing import Delivery
@@ -57,9 +57,6 @@ CONNECTIONS: Final = 4
 
 LOOK_S: Final = 0.2
 """Interval, in seconds, at which the stream is asked how far the hub is."""
-
-MIN_PACE: Final = 10.0
-"""Messages a second at the pace of real time at least, so that few sites give figures, too."""
 
 
 @dataclass(frozen=True)

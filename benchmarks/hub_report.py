@@ -7,8 +7,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from hub_sites import ARRAYS, EVENTS_PER_HOUR, MESSAGES_PER_HOUR
+from hub_sites import ARRAYS, EVENTS_PER_HOUR, MESSAGES_PER_HOUR, MIN_PACE
 from livessl.lab.evaluate.markdown import Block, Table, as_markdown
+from livessl.server.forwarding.link import REPORT_S
 from performance import Fit
 
 BEGIN: Final = "<!-- begin hub load -->\n"
@@ -16,6 +17,9 @@ END: Final = "<!-- end hub load -->"
 
 STREAM_BYTES: Final = 10_000_000_000
 """What the stream keeps by default (`stream.max_bytes`)."""
+
+PARTS: Final = {"hub": "the hub", "database": "PostgreSQL", "nats": "NATS"}
+"""Parts whose processor time is measured, by their names in the files, and as they are called on the page."""
 
 MANY: Final = 100_000_000
 """Stored events to which the fit of the answers is extended."""
@@ -49,10 +53,10 @@ def document(folder: Path) -> str:
         raise ValueError(f"{folder}: expected files sites-N.json or history-N.json; measure with --sites or --history")
     blocks: list[Block] = []
     if loads:
-        blocks += [_about(loads), _flood(loads)]
+        blocks += [_about(loads), _flood(loads), "Processor time and disk of that:", _costs(loads), *_limits(loads)]
         paced = [load for load in loads if "paced" in load]
         if paced:
-            blocks += ["At the pace of real time:", _paced(paced), *_limits(paced[-1])]
+            blocks += [f"At the pace of real time, or {MIN_PACE:.0f} messages a second if that is more:", _paced(paced)]
             blocks += [
                 "95 % of the API's answers take at most, in ms, at the pace of real time:",
                 _answers(paced, "sites"),
@@ -79,19 +83,37 @@ def _about(runs: Sequence[Json]) -> str:
 
 
 def _flood(loads: Sequence[Json]) -> Table:
-    titles = ("sites", "arrays", "messages", "published /s", "taken in /s", "times real time", "most waiting",
-              "bytes a message, stream", "bytes an event, database")  # fmt: skip
+    titles = ("sites", "arrays", "messages", "published /s", "taken in /s", "times real time", "most that waited")
     rows = [
         (
             *(f"{load['sites']}", f"{load['sites'] * len(ARRAYS)}", _messages(load)),
             *(f"{load['published_per_s']:.0f}", f"{load['taken_in_per_s']:.0f}"),
-            f"{load['taken_in_per_s'] / real_time_per_s(load['sites']):.0f}",
-            *(f"{load['most_waiting']}", f"{load['stream_bytes_per_message']:.0f}"),
+            f"{load['taken_in_per_s'] / real_time_per_s(load['sites']):.1f}",
+            f"{load['most_waiting']}",
+        )
+        for load in loads
+    ]
+    return Table(titles, rows)
+
+
+def _costs(loads: Sequence[Json]) -> Table:
+    titles = ("sites", *(f"{name}, ms a message" for name in PARTS.values()), "stream, bytes a message",
+              "database, bytes an event")  # fmt: skip
+    rows = [
+        (
+            f"{load['sites']}",
+            *(_number(load["processor_ms_per_message"].get(name), 2) for name in PARTS),
+            f"{load['stream_bytes_per_message']:.0f}",
             f"{load['database_bytes_per_event']:.0f}",
         )
         for load in loads
     ]
     return Table(titles, rows)
+
+
+def _number(value: float | None, digits: int, unit: str = "") -> str:
+    """Return a number as text; a dash for an SQLite file, which is no process."""
+    return "–" if value is None else f"{value:.{digits}f}{unit}"
 
 
 def _messages(load: Json) -> str:
@@ -101,37 +123,47 @@ def _messages(load: Json) -> str:
 
 def _paced(loads: Sequence[Json]) -> Table:
     titles = ("sites", "messages /s", "reports /s", "age of the oldest that waits: median, 95 %, longest",
-              "hub", "database", "NATS", "most memory of the hub")  # fmt: skip
+              *PARTS.values(), "most memory of the hub")  # fmt: skip
     rows = []
     for load in loads:
         paced, lag = load["paced"], load["paced"]["lag"]
-        shares = [paced["processor_share"].get(name) for name in ("hub", "database", "nats")]
+        shares = paced["processor_share"]
         rows.append(
             (
-                *(f"{load['sites']}", f"{paced['messages_per_s']:.0f}", f"{load['sites'] / 5:.1f}"),
+                *(f"{load['sites']}", f"{paced['messages_per_s']:.0f}", f"{load['sites'] / REPORT_S:.1f}"),
                 f"{lag['p50_ms'] / 1000:.2f}, {lag['p95_ms'] / 1000:.2f}, {lag['max_ms'] / 1000:.2f} s",
-                *("–" if share is None else f"{100 * share:.1f} % of a core" for share in shares),
+                *(_number(100 * shares[name] if name in shares else None, 1, " % of a core") for name in PARTS),
                 f"{load['hub_memory_mb']:.0f} MB",
             )
         )
     return Table(titles, rows)
 
 
-def _limits(load: Json) -> list[Block]:
-    """Return by what the number of sites is limited, the first limit first."""
-    sites, shares = load["sites"], load["paced"]["processor_share"]
-    day = 24 * MESSAGES_PER_HOUR * load["stream_bytes_per_message"]
-    stored = 24 * EVENTS_PER_HOUR * load["database_bytes_per_event"]
-    most = {f"one core of the {name}": sites / share for name, share in shares.items() if share > 0}
-    most["what the hub takes in at most"] = load["taken_in_per_s"] / real_time_per_s(1)
+def _limits(loads: Sequence[Json]) -> list[Block]:
+    """Return by what the number of sites is limited, the first limit first.
+
+    Processor time is that of the most sites, at the pace of real time if it was measured; disk is that of the longest
+    time, in which what sites send once counts least.
+    """
+    load, longest = loads[-1], max(loads, key=lambda each: (each["minutes"], each["sites"]))
+    sites, pace = load["sites"], real_time_per_s(load["sites"])
+    shares = {name: ms / 1000 * pace for name, ms in load["processor_ms_per_message"].items()}
+    if "paced" in load and pace >= MIN_PACE:
+        shares = load["paced"]["processor_share"]
+    day = 24 * MESSAGES_PER_HOUR * longest["stream_bytes_per_message"]
+    stored = 24 * EVENTS_PER_HOUR * longest["database_bytes_per_event"]
+    most = {f"a core for {PARTS[name]}": sites / share for name, share in shares.items() if share > 0}
+    most["what the hub took in here"] = load["taken_in_per_s"] / real_time_per_s(1)
     most["the stream's 10 GB, to keep a day"] = STREAM_BYTES / day
     rows = [(name, f"{count:.0f}") for name, count in sorted(most.items(), key=lambda each: each[1])]
+    reports, real = sites / REPORT_S / load["taken_in_per_s"], 1 / REPORT_S / real_time_per_s(1)
     costs = (
         f"A site of {len(ARRAYS)} arrays with {EVENTS_PER_HOUR} events an hour sends {MESSAGES_PER_HOUR} messages an "
-        f"hour, which take {day / 1e6:.1f} MB of the stream and {stored / 1e6:.1f} MB of the database a day, "
-        f"{' and '.join(f'{1e6 * share / sites:.0f} µs/s of the {name}' for name, share in shares.items())}."
+        f"hour, which take {day / 1e6:.1f} MB of the stream and {stored / 1e6:.1f} MB of the database a day (by the "
+        f"figures of {longest['sites']} sites). Processor times include those of reports: with {sites} sites, "
+        f"{reports:.1f} came with each message; at the pace of real time {real:.1f} do."
     )
-    return [costs, f"Limits, by the figures of {sites} sites:", Table(("limit", "sites"), rows)]
+    return [costs, f"Limits, by the processor times of {sites} sites:", Table(("limit", "sites"), rows)]
 
 
 def _answers(runs: Sequence[Json], key: str) -> Table:

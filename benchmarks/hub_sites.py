@@ -36,6 +36,10 @@ MESSAGES_PER_HOUR: Final = 3 * EVENTS_PER_HOUR + -(-60 // CHANGE_MINUTES) + -(-6
 """Messages of a site in an hour: events, beginnings and ends of their tracks, changes of arrays, alerts."""
 
 
+MIN_PACE: Final = 10.0
+"""Messages a second of all sites at the pace of real time at least, so that few sites give figures as well."""
+
+
 def site_name(number: int) -> str:
     """Return the name of a simulated site."""
     return f"site-{number:04d}"

@@ -32,6 +32,7 @@ ROOT = Path(__file__).parents[1]
 DEPLOY = ROOT / "deploy"
 STACK = DEPLOY / "stack" / "compose.yaml"
 PROGRAM = "/opt/livessl/bin/livessl"
+UNITS = ("livessl-server.service", "livessl-node@.service", "hub/livessl-hub.service")
 
 
 def unit(name: str) -> dict[str, list[str]]:
@@ -73,12 +74,12 @@ def commands() -> dict[str, list[str]]:
     return {place: words[1:] for place, words in found.items()}
 
 
-@pytest.mark.parametrize("name", ["livessl-server.service", "livessl-node@.service"])
+@pytest.mark.parametrize("name", UNITS)
 def test_systemd_accepts_the_unit(name: str, tmp_path: Path) -> None:
     require(shutil.which("systemd-analyze") is not None, "systemd-analyze is not installed (systemd)")
     text = (DEPLOY / name).read_text(encoding="utf-8")
     assert PROGRAM in text
-    path = tmp_path / name.replace("@", "@lab-pc")
+    path = tmp_path / Path(name).name.replace("@", "@lab-pc")
     path.write_text(text.replace(PROGRAM, "/bin/true"), encoding="utf-8")  # the check looks for the program
     checked = subprocess.run(
         ["systemd-analyze", "verify", "--man=no", str(path)], capture_output=True, text=True, check=False
@@ -88,7 +89,7 @@ def test_systemd_accepts_the_unit(name: str, tmp_path: Path) -> None:
     assert checked.returncode == 0, checked.stderr
 
 
-@pytest.mark.parametrize("name", ["livessl-server.service", "livessl-node@.service"])
+@pytest.mark.parametrize("name", UNITS)
 def test_unit_exposes_little(name: str) -> None:
     """By systemd's own measure, from 0 to 10; 4 and more it calls medium, and unprotected services have above 9."""
     require(shutil.which("systemd-analyze") is not None, "systemd-analyze is not installed (systemd)")
@@ -108,12 +109,20 @@ def test_reload_fails_for_a_faulty_site_file_before_the_server_is_asked() -> Non
     assert ask == "/bin/kill -HUP $MAINPID"
 
 
-@pytest.mark.parametrize("name", ["livessl-server.service", "livessl-node@.service"])
+@pytest.mark.parametrize("name", UNITS)
 def test_unit_comes_back_and_is_not_root(name: str) -> None:
     settings = unit(name)
     assert settings["Restart"] == ["always"]
     assert settings["DynamicUser"] == ["yes"]
     assert settings["NoNewPrivileges"] == ["yes"]
+
+
+@pytest.mark.parametrize("name", UNITS)
+def test_unit_is_started_again_if_it_hangs_and_leaves_no_sound_in_a_core_dump(name: str) -> None:
+    settings = unit(name)
+    assert settings["Type"] == ["notify"]
+    assert 10 <= int(settings["WatchdogSec"][0]) <= 60
+    assert settings["LimitCORE"] == ["0"]
 
 
 def test_node_reaches_the_sound_cards() -> None:

@@ -22,6 +22,7 @@ from conftest import require
 from hub_desk import make_hub, running_hub
 from livessl.clock import SystemClock, UnpacedClock
 from livessl.lab.processes import free_port
+from livessl.server.app import Server
 from livessl.server.engine import Engine
 from livessl.server.sign_of_life import SignOfLife
 from livessl.service_manager import MAX_STATUS, SIGNS, STATUS_NS, ServiceManager
@@ -166,6 +167,8 @@ def test_reload_is_reported_only_once_the_process_is_ready_and_nothing_after_its
         service.stopping()
         service.stopping()
         service.turn(lambda: "late")
+        with service.reloading():
+            pass
         assert manager.said[5:] == ["STOPPING=1", "STATUS=stopping"]
 
 
@@ -235,7 +238,9 @@ def test_hung_fusion_gives_no_sign_of_life_although_http_answers(
         with running_server(site_of(), service=service) as server:
             wait_until(lambda: manager.count("WATCHDOG=1") > 1, "signs of life")
             assert manager.said[0] == "READY=1"
-            assert any(line.startswith("STATUS=starting: north: ") for line in manager.said)
+            wait_until(
+                lambda: any(line.startswith("STATUS=starting: north: ") for line in manager.said), "the condition"
+            )
             fusion.hang()
             before = manager.count("WATCHDOG=1")
             fusion.wait_for_looks()
@@ -244,6 +249,52 @@ def test_hung_fusion_gives_no_sign_of_life_although_http_answers(
             fusion.go_on()
             wait_until(lambda: manager.count("WATCHDOG=1") > before, "a sign of life again")
         assert manager.said[-2:] == ["STOPPING=1", "STATUS=stopping"]
+
+
+def test_database_that_is_slow_holds_up_neither_signs_of_life_nor_http(tmp_path: Path) -> None:
+    """The condition is asked from the outbox of the alerts, among others, which a disk may hold for seconds."""
+    with listening(tmp_path, reads=True) as manager:
+        service = ServiceManager(SystemClock(), manager.address, 4_000)
+        with running_server(site_of(), service=service) as server:
+            asked, held = Flag(), Flag()
+
+            def slow() -> str:
+                asked.set()
+                held.wait(HANG_S)
+                raise OSError("the disk is gone")
+
+            server._sign_of_life._describe = slow  # type: ignore[method-assign]
+            assert asked.wait(HANG_S)
+            before = manager.count("WATCHDOG=1")
+            wait_until(lambda: manager.count("WATCHDOG=1") > before + 3, "signs of life")
+            assert httpx.get(f"{server.url}/api/v1/events", timeout=HANG_S).status_code == 200
+            held.set()
+            before = manager.count("WATCHDOG=1")
+            wait_until(lambda: manager.count("WATCHDOG=1") > before + 3, "signs of life after an error")
+
+
+def test_state_that_cannot_be_told_is_logged_and_the_sign_of_life_is_sent(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with listening(tmp_path) as manager:
+        service = ServiceManager(SteppedClock(), manager.address, 4_000_000_000)
+
+        def fails() -> str:
+            raise ValueError("no words")
+
+        service.turn(fails)
+        assert manager.said == ["READY=1", "WATCHDOG=1"]
+        assert "no words" in caplog.text
+
+
+def test_server_ends_with_the_error_of_a_task_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(sign: SignOfLife) -> None:
+        raise ValueError("nobody would know")
+
+    monkeypatch.setattr(SignOfLife, "give", fails)
+    server = Server(site_of(), SystemClock())
+    with pytest.raises(ValueError, match="nobody would know"):
+        server.run()
 
 
 def test_hub_is_ready_when_it_serves_and_says_what_it_waits_for(tmp_path: Path) -> None:

@@ -13,8 +13,7 @@ import numpy as np
 import scipy
 
 from livessl.core.commission.arrivals import Arrivals, mean_times_s
-from livessl.core.commission.findings import LEAST_SHARPNESS
-from livessl.core.commission.observe import observe, receive
+from livessl.core.commission.observe import LEAST_SHARPNESS, observe, receive
 from livessl.core.geometry import Grid, circle
 from livessl.core.locate.estimator import Sound, create
 from livessl.core.locate.map_estimator import MapEstimator

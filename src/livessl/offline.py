@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from livessl import wire
-from livessl.clock import Clock, UnpacedClock
+from livessl.clock import UnpacedClock
 from livessl.core.locate.estimator import Sound
 from livessl.core.types import (
     MAX_SAMPLE,
@@ -28,7 +28,7 @@ from livessl.core.types import (
 )
 from livessl.errors import DeviceError
 from livessl.recordings.assign import AssignedRecording, assign_files, make_pipelines, recording_channels
-from livessl.recordings.play import paced_messages
+from livessl.recordings.play import unpaced_messages
 from livessl.recordings.recording import MemoryRecording
 from livessl.site.build.fusion import make_estimator, make_fusion
 from livessl.site.load import load_site
@@ -162,7 +162,7 @@ def assigned(
 def run(
     site: Site,
     recordings: Sequence[AssignedRecording],
-    clock: Clock,
+    clock: UnpacedClock,
     *,
     method: str | None = None,
     backfill: bool = True,
@@ -170,7 +170,8 @@ def run(
 ) -> Iterator[Output]:
     """Yield all outputs of the fusion for recordings; events are in order of time.
 
-    With `backfill`, frames of a sound are requested from arrays that did not detect it, as a live server does.
+    With `backfill`, frames of a sound are requested from arrays that did not detect it, as a live server does. `clock`
+    has the time of the sound that is processed.
 
     Raises
     ------
@@ -184,7 +185,8 @@ def run(
             for array in pipeline.arrays:
                 fusion.set_answers(array, True)
     now_ns = 0
-    for now_ns, batch in _together(paced_messages(pipelines, inputs, clock)):
+    for now_ns, batch in _together(unpaced_messages(pipelines, inputs)):
+        clock.sleep_until_ns(now_ns)
         outputs = fusion.step(_over_the_wire(batch), now_ns)
         while requests := [output for output in outputs if isinstance(output, BackfillRequest)]:
             yield from (output for output in outputs if not isinstance(output, BackfillRequest))

@@ -65,9 +65,14 @@ class ServiceManager:
         return cls(clock, address or None, int(silence_us) * 1000)
 
     @property
+    def is_there(self) -> bool:
+        """Whether a service manager has started this process."""
+        return self._address is not None
+
+    @property
     def watches(self) -> bool:
         """Whether it kills this process if no sign of life comes."""
-        return self._address is not None and self._silence_ns is not None
+        return self.is_there and self._silence_ns is not None
 
     def turn(self, describe: Callable[[], str]) -> None:
         """Report that this process is ready and alive; call it from the loop that must not hang, as often as it turns.
@@ -86,7 +91,7 @@ class ServiceManager:
         status = self._status
         if _is_over(self._looked_ns, STATUS_NS, now_ns):
             self._looked_ns = now_ns
-            status = " ".join(describe().split())[:MAX_STATUS]
+            status = self._in_words(describe)
         lines = [
             *(() if self._is_ready else ("READY=1",)),
             *(("WATCHDOG=1",) if is_due else ()),
@@ -99,20 +104,29 @@ class ServiceManager:
     @contextmanager
     def reloading(self) -> Iterator[None]:
         """Report that settings are read again while the context lasts."""
-        if not self._is_ready:  # then `turn` reports that it is
+        if not self._is_ready or self._is_stopping:  # if it is not ready, `turn` reports it later
             yield
             return
         self._send("RELOADING=1", f"MONOTONIC_USEC={self._clock.monotonic_ns() // 1000}")
         try:
             yield
         finally:
-            self._is_ready = self._send("READY=1")  # if it fails, `turn` sends it
+            if not self._is_stopping:
+                self._is_ready = self._send("READY=1")  # if it fails, `turn` sends it
 
     def stopping(self) -> None:
         """Report that this process ends; nothing is reported after that."""
         if not self._is_stopping:
             self._is_stopping = True
             self._send("STOPPING=1", "STATUS=stopping")
+
+    def _in_words(self, describe: Callable[[], str]) -> str:
+        """Return the state in one line, or the one before if it cannot be told: a sign of life needs no words."""
+        try:
+            return " ".join(describe().split())[:MAX_STATUS]
+        except Exception:  # noqa: BLE001 - whatever fails there, the process is alive
+            _log.exception("the state for the service manager cannot be told")
+            return self._status
 
     def _send(self, *lines: str) -> bool:
         """Send lines, and return whether they were sent; a service manager that takes none ends nothing here."""
@@ -121,7 +135,9 @@ class ServiceManager:
         address = "\0" + self._address[1:] if self._address.startswith("@") else self._address
         try:
             with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender:
-                sender.sendto("\n".join(lines).encode(), socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL, address)
+                sender.sendto(
+                    "\n".join(lines).encode(errors="replace"), socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL, address
+                )
         except OSError as error:
             if not self._fails:
                 _log.warning(

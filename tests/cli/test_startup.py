@@ -92,6 +92,41 @@ def test_serve_imports_nothing_of_other_commands(tmp_path: Path) -> None:
     assert names & LOADED_BY_THE_FUSION_THREAD == set()
 
 
+IDLE = """
+import json, sys, time
+from urllib.request import urlopen
+from pathlib import Path
+from threading import Thread
+from livessl.clock import SystemClock
+from livessl.server.app import Server
+from livessl.site.load import load_site
+server = Server(load_site(Path(sys.argv[1])), SystemClock())
+before = server.parts.refiner.refinement
+running = Thread(target=server.run)
+running.start()
+while server.parts.refiner.refinement is before and running.is_alive():
+    time.sleep(0.1)
+with urlopen(server.url + "/api/v1/health") as answer:
+    assert answer.status == 200
+names = sorted(sys.modules)
+server.stop()
+running.join()
+print(json.dumps(names))
+"""
+
+
+def test_a_server_without_sounds_loads_nothing_that_examines_them(tmp_path: Path) -> None:
+    """The optimizer takes 50 MB. Without compiled kernels a server needs `scipy.sparse` as well."""
+    text = PAPER.read_text(encoding="utf-8").replace(":5570", ":0").replace("port: 8000", "port: 0")
+    site = tmp_path / "site.yaml"
+    site.write_text(text, encoding="utf-8")
+    done = subprocess.run([sys.executable, "-c", IDLE, str(site)], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    names = set(json.loads(done.stdout.splitlines()[-1]))
+    assert {"livessl.core.locate.peak_search", "livessl.server.pose_refiner"} <= names
+    assert names & (NEVER_LIVE | {"scipy.optimize", "PIL", "apprise", "nats"}) - {"scipy.sparse"} == set()
+
+
 EVALUATION = {"livessl.cli.evaluate", "livessl.lab.evaluate", "livessl.lab.evaluate.paper"}
 
 

@@ -140,6 +140,7 @@ class Operator:
     zones: Zones = field(default_factory=dict)
     armed: bool = False
     edits: int = 0
+    drawn: int = 0
     changes: int = 0
     forgotten: list[str] = field(default_factory=list)
     under_way: bool = False
@@ -150,17 +151,28 @@ class Operator:
     _armed: bool | None = None  # the same of the rule
 
     def change(self) -> None:
-        """Make the next edit of a zone, and switch the rule; without an answer both outcomes are possible."""
-        step, name = self.edits % 3, f"drawn-{self.edits // 3}"
+        """Make the next edit of a zone and switch the rule, in turns this or that first.
+
+        Without an answer both outcomes are possible.
+        """
+        edits = [self._edit_zone, self._switch]
+        self.edits += 1
+        for edit in edits[:: 1 if self.edits % 2 else -1]:
+            edit()
+
+    def _edit_zone(self) -> None:
+        step, name = self.drawn % 3, f"drawn-{self.drawn // 3}"
         wanted = {other: zone for other, zone in self.zones.items() if other != name}
         if step < 2:
             wanted[name] = SHAPES[step]
-        self.edits += 1
+        self.drawn += 1
         self._zones = wanted
         body = {"polygon_m": SHAPES[step]} if step < 2 else None
         if step < 2 or name in self.zones:
             self._send("DELETE" if body is None else "PUT", f"zones/{name}", body)
         self.zones, self._zones = wanted, None
+
+    def _switch(self) -> None:
         self._armed = not self.armed
         self._send("PUT", "alerts/rules/switched/armed", {"armed": self._armed})
         self.armed, self._armed = self._armed, None
@@ -210,7 +222,7 @@ class Operator:
             self.begun_s, self.under_way = time.monotonic(), True
             client.send(request).raise_for_status()
             self.under_way = False
-        self.usual_s = time.monotonic() - self.begun_s
+        self.usual_s = max(0.5 * self.usual_s, time.monotonic() - self.begun_s)
         self.changes += 1
 
 
@@ -240,7 +252,7 @@ def play_killed(recordings: Path, directory: Path, kills: int, seed: int) -> Out
             time.sleep(chance.uniform(0.0, 0.5))
             operator.change()
             if killed % 2 == 0 or killed >= kills:
-                interrupted += operator_interrupted(site, operator, chance.uniform(0.0, 2.0 * operator.usual_s))
+                interrupted += operator_interrupted(site, operator, chance.uniform(0.0, 4.0 * operator.usual_s))
             else:
                 time.sleep(chance.uniform(0.0, 0.05))
                 site.kill_server()

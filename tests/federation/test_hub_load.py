@@ -81,7 +81,7 @@ def test_one_site_is_measured_from_the_stream_to_the_answers(tmp_path: Path) -> 
     (tmp_path / "sites-1.json").write_text(json.dumps({**ABOUT, **found}))
     said = document(tmp_path)
     assert f"| 1 | 8 | {found['messages']} of 60 min | " in said
-    assert "Limits, by the figures of 1 sites:" in said
+    assert "Limits, by the processor times of 1 sites:" in said
 
 
 ABOUT: dict[str, Any] = {
@@ -93,7 +93,7 @@ TIMES = {"p50_ms": 100.0, "p95_ms": 200.0, "max_ms": 300.0, "count": 9}
 
 
 def load(sites: int) -> dict[str, Any]:
-    """A hub that takes 2000 messages a second in, and a twentieth of a core for 100 sites."""
+    """A hub that takes 2000 messages a second in, at 0.4 ms each."""
     return {
         **ABOUT,
         "sites": sites,
@@ -122,7 +122,11 @@ def test_tables_name_the_limit_that_comes_first(tmp_path: Path) -> None:
     for sites in (10, 1000):
         (tmp_path / f"sites-{sites}.json").write_text(json.dumps(load(sites)))
     said = document(tmp_path)
-    assert said.index("| one core of the hub | 2000 |") < said.index("| what the hub takes in at most |")
+    # half a core for 1000 sites; 191 messages an hour: 10 GB / (24 x 191 x 1000 bytes), 2000 / s x 3600 s / 191
+    limits = ["the hub | 2000 |", "the stream's 10 GB, to keep a day | 2182 |", "what the hub took in here | 37696 |"]
+    places = [said.index(limit) for limit in limits]
+    assert places == sorted(places)
+    assert "0.1 came with each message; at the pace of real time 3.8 do" in said
     assert said.index("| 10 | 80 | 2000 of 60 min |") < said.index("| 1000 | 8000 | 200000 of 60 min |")
     assert "did nothing else meanwhile (load average at the begin of each run: 0.2, 0.2)" in said
     late = {**load(1000), "is_drained": False, "minutes": 15}
@@ -130,7 +134,7 @@ def test_tables_name_the_limit_that_comes_first(tmp_path: Path) -> None:
     (tmp_path / "sites-1000.json").write_text(json.dumps(late))
     said = document(tmp_path)
     assert "| 1000 | 8000 | 200000 of 15 min, not all taken in |" in said
-    assert "Limits, by the figures of 10 sites:" in said, "of the most sites with figures"
+    assert "At the pace of real time" in said, "the figures of 10 sites"
 
 
 def test_answers_are_extended_by_what_they_follow(tmp_path: Path) -> None:

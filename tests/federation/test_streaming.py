@@ -82,6 +82,30 @@ def intake(tmp_path: Path) -> Any:
     archive.close()
 
 
+def test_intake_ends_whole_although_its_connection_loses_cancellations(intake: Any) -> None:
+    lost, left = 0, False
+
+    async def receive() -> None:
+        nonlocal lost, left
+        try:
+            for _ in range(3):
+                with suppress(asyncio.CancelledError):
+                    await asyncio.sleep(1000)
+                lost += 1
+            await asyncio.sleep(1000)
+        finally:
+            left = True
+
+    async def work() -> None:
+        intake._receive = receive
+        running = asyncio.create_task(intake.run())
+        await asyncio.sleep(0.01)
+        await ended(running)
+        assert (lost, left) == (3, True)
+
+    asyncio.run(work())
+
+
 @settings(max_examples=20, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(count=st.integers(1, 40), most=st.integers(1, 40), status=st.sampled_from(["404", "408"]))
 def test_a_request_ends_by_its_last_message_or_its_status_without_a_wait(

@@ -13,11 +13,13 @@ from hypothesis import strategies as st
 
 from livessl import wire
 from livessl.clock import UnpacedClock
-from livessl.core.types import FRAME_NS, Block, ClockState, Float32Array, Frame, Mark, Message
+from livessl.core.stream.activity import ActivityParameters
+from livessl.core.stream.pipeline import Pipeline, Wiring
+from livessl.core.types import FRAME_NS, ArraySpec, Block, ClockState, Float32Array, Frame, Mark, Message
 from livessl.errors import DeviceError
 from livessl.recordings.assign import recording_channels
-from livessl.recordings.play import paced_messages
-from livessl.recordings.recording import MemoryRecording, TimedRecording
+from livessl.recordings.play import paced_messages, unpaced_messages
+from livessl.recordings.recording import MemoryRecording, SplicedRecording, TimedRecording
 from livessl.site.build.pipeline import make_pipeline
 from livessl.site.models import Site
 from small_site import RATE_HZ, Changes, hiss, site_of
@@ -116,6 +118,41 @@ def test_paced_messages_are_those_of_the_pipelines() -> None:
     assert known_ns == START_NS + 2_000_000_000
     for array in BOTH:
         assert by_array(made, array) == by_array(WHOLE, array)
+
+
+@given(
+    rate_hz=st.sampled_from([16_000.0, 22_050.0, 44_100.0]),
+    channels=st.integers(2, 16),
+    offset_ns=st.integers(0, 90_000_000),
+    gap_ns=st.sampled_from([0, 30_000_000, 170_000_000]),
+    seed=st.integers(0, 1 << 30),
+)
+@settings(max_examples=8, deadline=None)
+def test_blocks_passed_together_give_the_same_messages_at_the_same_times(
+    rate_hz: float, channels: int, offset_ns: int, gap_ns: int, seed: int
+) -> None:
+    """To the last bit, for narrow and wide arrays whose recordings begin at different times and have a gap."""
+    rng = np.random.default_rng(seed)
+    samples = rng.normal(0.0, 1e-3, (channels, round(2.0 * rate_hz))).astype(np.float32)
+    samples[:, round(1.3 * rate_hz) : round(1.5 * rate_hz)] *= 200.0
+    wide = TimedRecording(MemoryRecording("wide", rate_hz, samples), START_NS)
+    later = replace(wide, start_ns=START_NS + 2_000_000_000 + gap_ns)
+    stereo = TimedRecording(MemoryRecording("two", rate_hz, samples[:2]), START_NS + offset_ns)
+    recordings = [TimedRecording(SplicedRecording((wide, later)), START_NS), stereo]
+
+    def pipelines() -> list[Pipeline]:
+        places_m = np.random.default_rng(1).uniform(0.0, 0.3, (channels, 3))
+        specs = [ArraySpec(name, places_m[:count], (100.0, 6000.0)) for name, count in (("wide", channels), ("two", 2))]
+        wirings = [Wiring(spec, np.arange(len(spec.microphones_m))) for spec in specs]
+        return [Pipeline([wiring], rate_hz, ActivityParameters()) for wiring in wirings]
+
+    clock = UnpacedClock(START_NS)
+    one_by_one = [
+        (end_ns, [*map(wire.encode, some)]) for end_ns, some in paced_messages(pipelines(), recordings, clock)
+    ]
+    together = [(end_ns, [*map(wire.encode, some)]) for end_ns, some in unpaced_messages(pipelines(), recordings)]
+    assert together == one_by_one
+    assert sum(len(some) for _, some in together) > 100
 
 
 def test_messages_of_a_short_recording_are_flushed() -> None:

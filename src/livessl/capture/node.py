@@ -117,15 +117,17 @@ def capture_recordings(
     """
     pipelines, inputs = make_pipelines(site, recordings, reports_levels=True)
     link = _link(site, name, site.nodes[name].server, pipelines, clock, run_id, _spool(site, name))
-    with HostWatch() as host:
-        for end_ns in _sent(link, pipelines, inputs, clock, stop, host):
-            if service is not None:
-                service.turn(partial(_in_words, link))
-            if progress is not None:
-                progress(end_ns)
-    if service is not None:
-        service.stopping()
-    _finish(link, clock, stop)
+    try:
+        with HostWatch() as host:
+            for end_ns in _sent(link, pipelines, inputs, clock, stop, host):
+                if service is not None:
+                    service.turn(partial(_in_words, link))
+                if progress is not None:
+                    progress(end_ns)
+        _finish(link, clock, stop, service)
+    finally:
+        if service is not None:
+            service.stopping()
 
 
 def with_host(
@@ -250,12 +252,14 @@ def _sent(
         yield end_ns
 
 
-def _finish(link: Link, clock: Clock, stop: Stop) -> None:
-    """Wait for the last acknowledgement, then close the link with a good-bye."""
+def _finish(link: Link, clock: Clock, stop: Stop, service: ServiceManager | None = None) -> None:
+    """Wait for the last acknowledgement, which may be long in coming, then close the link with a good-bye."""
     answered_ns = clock.monotonic_ns()
     while link.pending and not (stop() or link.refused) and clock.monotonic_ns() - answered_ns < DRAIN_NS:
         if link.connected:
             answered_ns = clock.monotonic_ns()
+        if service is not None:
+            service.turn(partial(_in_words, link))
         _pause(link, clock)
     undelivered, refused = link.pending + link.dropped, link.refused
     link.close(bye=True)

@@ -10,8 +10,8 @@ import numpy as np
 
 from livessl.calibration import Clap, HeardSound, measured_poses
 from livessl.cli.calibration_words import progress_line
-from livessl.core.commission.findings import LEAST_SHARPNESS
 from livessl.core.commission.next_place import AIM_DEG, AIM_M
+from livessl.core.commission.observe import LEAST_SHARPNESS
 from livessl.core.commission.resection import LEAST_PLACES, MeasuredSetUp
 from livessl.core.types import Observation
 from livessl.errors import RunError

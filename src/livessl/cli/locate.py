@@ -10,6 +10,7 @@ from livessl.cli.exits import OK
 from livessl.cli.options import add_joint, add_json, add_method, add_site, add_wav, import_from_here, read_site, wavs
 from livessl.cli.output import complain, print_event, print_warnings
 from livessl.clock import UnpacedClock
+from livessl.garbage import collected_seldom
 
 
 def add_arguments(parser: Any) -> None:
@@ -28,6 +29,11 @@ def add_arguments(parser: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
+    with collected_seldom():
+        return _run(arguments)
+
+
+def _run(arguments: argparse.Namespace) -> int:
     from livessl import offline
     from livessl.core.types import Event
     from livessl.recordings.assign import assign_files, span_ns

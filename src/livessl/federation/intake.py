@@ -30,6 +30,7 @@ from livessl.server.forwarding.stream import (
     STREAM,
     connect_options,
     connected,
+    ended,
     health_of_all,
     nats_library,
     parse_message_id,
@@ -129,7 +130,13 @@ class Intake:
 
     async def run(self) -> None:
         """Receive until cancelled, and connect again whenever that is needed."""
-        await asyncio.gather(self._stay_connected(), self._store_reports())
+        tasks = asyncio.create_task(self._stay_connected()), asyncio.create_task(self._store_reports())
+        try:
+            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            await ended(*tasks)
+        for task in done:
+            task.result()  # raises the error that ended it
 
     async def _stay_connected(self) -> None:
         while True:

@@ -175,12 +175,18 @@ def merged_blocks(recordings: Sequence[TimedRecording]) -> Iterator[tuple[int, i
     block : Block
     """
 
-    def with_end(index: int, timed: TimedRecording) -> Iterator[tuple[int, int, Block]]:
-        for block in timed.recording.blocks(timed.start_ns):
-            length_ns = round(int(block.samples.shape[1]) / timed.recording.sample_rate_hz * 1e9)
-            yield block.stamp_ns + length_ns, index, block
+    def indexed(index: int, timed: TimedRecording) -> Iterator[tuple[int, int, Block]]:
+        for end_ns, block in timed_blocks(timed):
+            yield end_ns, index, block
 
-    return heapq.merge(*(with_end(k, timed) for k, timed in enumerate(recordings)), key=lambda entry: entry[:2])
+    return heapq.merge(*(indexed(k, timed) for k, timed in enumerate(recordings)), key=lambda entry: entry[:2])
+
+
+def timed_blocks(timed: TimedRecording) -> Iterator[tuple[int, Block]]:
+    """Yield the blocks of a recording, each with the site time at which it is complete."""
+    rate_hz = timed.recording.sample_rate_hz
+    for block in timed.recording.blocks(timed.start_ns):
+        yield block.stamp_ns + round(int(block.samples.shape[1]) / rate_hz * 1e9), block
 
 
 def paced_blocks(recordings: Sequence[TimedRecording], clock: Clock) -> Iterator[tuple[int, int, Block]]:

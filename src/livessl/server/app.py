@@ -15,7 +15,7 @@ from livessl.errors import ConfigError
 from livessl.garbage import collect_as_usual
 from livessl.server.alerts.evidence import Evidence
 from livessl.server.alerts.in_force import Surroundings
-from livessl.server.alerts.outbox import OutboxError
+from livessl.server.alerts.restoration import restore_alerts
 from livessl.server.alerts.service import Alerts, Conditions
 from livessl.server.api.app import create_app
 from livessl.server.api.auth import Access
@@ -68,14 +68,6 @@ releases it thousands of times a second; by Python's default it would wait 5 ms 
 
 WATCH_S: Final = 0.2
 """Interval, in seconds, at which the threads are checked for a failure."""
-
-RESTORED: Final = 10_000
-"""Most alerts of the outbox, about 20 MB, that a start puts into the journal because it lacks them; the next start goes
-on with the others."""
-
-RESTORED_AGAIN: Final = 100
-"""Newest alerts of the outbox that are put at each start into the messages for the hub, and into a
-journal in memory."""
 
 _log = logging.getLogger(__name__)
 
@@ -339,7 +331,7 @@ class Server:
         self.loop = asyncio.get_running_loop()
         if not self._stepped:
             self.parts.store.backlog.start()  # before everything that stores: from now on nothing waits for a database
-        self._restore_alerts()
+        restore_alerts(self.parts)
         self.parts.receiver.start()
         self.parts.maps.start()
         self.parts.set_up_watch.start()
@@ -353,32 +345,26 @@ class Server:
         if not self._stepped:
             self.parts.engine.start(self._kernel_loader.load)
         retention = delete_old_events(self.parts.store, self._clock, self.parts.site.store.retention_days)
-        tasks = [asyncio.create_task(work) for work in (self._watch(), retention, self._access.reload_tokens())]
+        works = self._watch(), self._sign_of_life.describe(), retention, self._access.reload_tokens()
+        tasks = [asyncio.create_task(work) for work in works]
+        for task in tasks:
+            task.add_done_callback(self._stop_on_error)
         try:
             await self.uvicorn.serve(sockets=[self._listener])
         finally:
             self._service.stopping()
             for task in tasks:
                 task.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)
+            ends = await asyncio.gather(*tasks, return_exceptions=True)
             self.loop = None
+        for error in ends:
+            if isinstance(error, Exception):
+                raise error
 
-    def _restore_alerts(self) -> None:
-        """Put into the journal the alerts that are in the outbox only, as after an outage of the database.
-
-        The hub gets the newest ones again, and knows which it has: they may not have been among its messages yet.
-        """
-        alerts, is_durable = self.parts.alerts, self.parts.store.is_durable
-        try:
-            newest = [alert for _, alert in reversed(alerts.outbox.recent(RESTORED_AGAIN))]
-            missing = alerts.outbox.not_in_journal(RESTORED) if is_durable else newest
-        except OutboxError as error:
-            _log.error("%s", error)
-            return
-        for alert in missing:
-            self.parts.journal.alert(alert, partial(alerts.note_in_journal, alert) if is_durable else None)
-        if self.parts.hub_link is not None:
-            self.parts.hub_link.take_alerts(newest)
+    def _stop_on_error(self, task: asyncio.Task[None]) -> None:
+        """Stop if a task has failed: what it did would be missed, and nobody would know."""
+        if not task.cancelled() and task.exception() is not None:
+            self.stop()
 
     async def _watch(self) -> None:
         """Stop when a thread has failed: a service manager restarts a server that ends, not one that looks alive."""

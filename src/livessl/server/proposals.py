@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from livessl.clock import Clock
+from livessl.core.commission.observe import LEAST_SHARPNESS
 from livessl.core.types import ArraySpec, FloatArray, Observation
 from livessl.errors import RunError
 from livessl.server.heard_sounds import HeardSound, HeardSounds
@@ -267,7 +268,6 @@ class Proposals:
 
 def shared_sounds(sounds: Sequence[HeardSound]) -> list[HeardSound]:
     """Return the sounds that two arrays or more received clearly; at most the newest `MOST_SOUNDS`."""
-    from livessl.core.commission.findings import LEAST_SHARPNESS
 
     def is_clear(one: Observation) -> bool:
         return one.sharpness >= LEAST_SHARPNESS and int(np.isfinite(one.delays_s).sum()) > 1

@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+import asyncio
+import logging
 from collections.abc import Callable
+from typing import Final
 
 from livessl.server.api.routes import condition
 from livessl.server.parts import Parts
 from livessl.service_manager import ServiceManager
+
+DESCRIBE_S: Final = 1.0
+"""Interval, in seconds, at which the condition is looked at."""
+
+_log = logging.getLogger(__name__)
 
 
 class SignOfLife:
@@ -30,13 +38,27 @@ class SignOfLife:
         self._url = url
         self._is_listening = is_listening
         self._turns = 0
+        self._words = "started"
+
+    async def describe(self) -> None:
+        """Look at the condition from time to time, in another thread: databases and disks that it asks may be slow."""
+        has_complained = False
+        while self._service.is_there:
+            try:
+                self._words = await asyncio.to_thread(self._describe)
+                has_complained = False
+            except Exception:  # noqa: BLE001 - whatever fails there, the server is alive
+                if not has_complained:
+                    _log.exception("the condition for the service manager cannot be told")
+                has_complained = True
+            await asyncio.sleep(DESCRIBE_S)
 
     def give(self) -> None:
-        """Report, if the fusion thread has taken a turn since the last call."""
+        """Report, if the fusion thread has taken a turn since the last call; never wait."""
         turns = self._parts.engine.turns
         if turns != self._turns and self._is_listening():
             self._turns = turns
-            self._service.turn(self._describe)
+            self._service.turn(lambda: self._words)
 
     def _describe(self) -> str:
         status, reasons = condition(self._parts, self._parts.array_states.describe(levels=False))

@@ -15,7 +15,6 @@ from base64 import urlsafe_b64encode
 from enum import Enum, auto
 from pathlib import Path
 from typing import Final
-from urllib.parse import quote
 
 from livessl.clock import Clock
 from livessl.errors import ConfigError
@@ -27,8 +26,14 @@ PARAMETERS: Final = ("expires", "signature")
 
 SECRET_BYTES: Final = 32
 
-_LINKABLE: Final = re.compile(r"/api/v1/(?:alerts/[^/]+/picture\.png|events/[^/]+/clips/[^/]+|map)")
-"""Paths that a link may open. Whatever else was signed by mistake stays closed."""
+LIVE_PATH: Final = "/api/v1/map"
+"""The one path that a link may open whose content changes: it shows what happens now."""
+
+_ID: Final = "[A-Za-z0-9._-]+"
+LINKABLE: Final = rf"/api/v1/(alerts/{_ID}/picture\.png|events/{_ID}/clips/{_ID}|map)"
+"""Pattern of the paths that a link may open. Whatever else was signed by mistake stays closed."""
+
+_LINKABLE: Final = re.compile(LINKABLE)
 
 _CONTEXT: Final = b"livessl link 1\n"
 """First line of what is signed, so that no signature of another kind is valid here."""
@@ -72,12 +77,12 @@ class SignedLinks:
             self._read(secret)
 
     def sign(self, path: str, lifetime_s: float) -> tuple[str, int]:
-        """Return a path of the API as a link, percent-encoded, and when it expires, in nanoseconds since the epoch.
+        """Return a path of the API as a link, and when it expires, in nanoseconds since the epoch.
 
         Parameters
         ----------
         path : str
-            Path without the site's `root_path`, decoded.
+            Path without the site's `root_path`.
         lifetime_s : float
 
         Raises
@@ -89,7 +94,7 @@ class SignedLinks:
             raise ValueError(f"expected the path of a picture, a recording or a map, got {path!r}")
         expires_s = self._clock.now_ns() // 1_000_000_000 + max(1, round(lifetime_s))
         signature = _signature(self._current_key(makes=True), path, str(expires_s))
-        return f"{quote(path)}?expires={expires_s}&signature={signature}", expires_s * 1_000_000_000
+        return f"{path}?expires={expires_s}&signature={signature}", expires_s * 1_000_000_000
 
     def check(self, path: str, expires: str, signature: str) -> Verdict:
         """Check a link. The time that this takes does not depend on how much of a wrong signature is right.
@@ -101,9 +106,9 @@ class SignedLinks:
         expires, signature : str
             Parameters of the request.
         """
-        expected = _signature(self._current_key(), path, expires)
-        is_signed = hmac.compare_digest(expected.encode(), signature.encode("utf-8", "surrogateescape"))
-        if not is_signed or not is_linkable(path) or not _SECONDS.fullmatch(expires):
+        if not is_linkable(path) or not _SECONDS.fullmatch(expires) or not signature.isascii():
+            return Verdict.INVALID
+        if not hmac.compare_digest(_signature(self._current_key(), path, expires), signature):
             return Verdict.INVALID
         return Verdict.VALID if self._clock.now_ns() < int(expires) * 1_000_000_000 else Verdict.EXPIRED
 
@@ -140,5 +145,5 @@ def is_linkable(path: str) -> bool:
 
 
 def _signature(key: bytes, path: str, expires: str) -> str:
-    signed = _CONTEXT + f"{expires}\n{path}".encode("utf-8", "surrogateescape")
+    signed = _CONTEXT + f"{expires}\n{path}".encode("ascii")
     return urlsafe_b64encode(hmac.digest(key, signed, "sha256")).decode().rstrip("=")

@@ -9,10 +9,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from free_field import C_M_S, RATE_HZ, ideal_gcc, tetra, true_lags_s
-from livessl.core.geometry import Grid
+from free_field import BAND_HZ, C_M_S, RATE_HZ, ideal_gcc, tetra, true_lags_s
+from livessl.core.geometry import Grid, line, posed
 from livessl.core.locate import refine
-from livessl.core.locate.confidence import LEAST_CONFIDENCE, ConfidenceFeatures, Judgement, crossing_deg, judge
+from livessl.core.locate.confidence import (
+    CLEAR_PEAK_TO_RMS,
+    LEAST_CONFIDENCE,
+    ConfidenceFeatures,
+    Judgement,
+    crossing_deg,
+    judge,
+)
 from livessl.core.locate.srp import SRPFunctional
 from livessl.core.types import ArraySpec, Evidence
 
@@ -62,8 +69,8 @@ def test_an_array_with_only_noise_hardly_lowers_the_peak_to_rms_ratio() -> None:
 
 def test_crossing_lines_of_sight_determine_the_distance_whatever_the_margin() -> None:
     assert (
-        ConfidenceFeatures(0.01, 5.0, crossing_deg=45.0).confidence
-        > ConfidenceFeatures(0.01, 5.0, crossing_deg=5.0).confidence + 0.2
+        ConfidenceFeatures(0.01, 5.0, crossing_deg=45.0, second_array=2.5).confidence
+        > ConfidenceFeatures(0.01, 5.0, crossing_deg=5.0, second_array=2.5).confidence + 0.2
     )
     east = tetra("east", [2.0, 0.0, 1.0])
     west = tetra("west", [0.0, 2.0, 1.0])
@@ -71,6 +78,40 @@ def test_crossing_lines_of_sight_determine_the_distance_whatever_the_margin() ->
     assert crossing_deg([east, west], np.array([2.0, 2.0, 1.0])) == pytest.approx(90.0, abs=3.0)
     beyond = east.centre_m + 3.0 * (west.centre_m - east.centre_m)
     assert crossing_deg([east, west], beyond) == pytest.approx(0.0, abs=1e-3)
+
+
+@given(weak=st.floats(0.0, 1.9), more=st.floats(0.05, 0.5))
+def test_a_second_array_with_a_weak_peak_hardly_determines_the_distance(weak: float, more: float) -> None:
+    first = ConfidenceFeatures(0.05, 6.0, crossing_deg=60.0, second_array=weak)
+    assert replace(first, second_array=weak + more).confidence > first.confidence
+    clear = replace(first, second_array=CLEAR_PEAK_TO_RMS)
+    assert replace(clear, second_array=CLEAR_PEAK_TO_RMS + more).confidence == clear.confidence
+
+
+@given(spread_m=st.floats(0.01, 0.2), more=st.floats(0.05, 1.0))
+def test_confidence_of_lines_falls_with_the_spread_of_a_position(spread_m: float, more: float) -> None:
+    near = ConfidenceFeatures(0.5, 8.0, spread_m=spread_m, of_lines=True)
+    assert replace(near, spread_m=spread_m + more).confidence < near.confidence
+    assert replace(near, spread_m=0.2).confidence < LEAST_CONFIDENCE
+    assert replace(near, spread_m=0.005).confidence > 0.95
+    assert replace(near, of_lines=False).confidence > 0.95
+
+
+def test_lines_of_microphones_have_no_lines_of_sight() -> None:
+    """Three lines give as many angles as there are coordinates: a clear peak is anywhere where three cones meet."""
+    places = ([2.1, 0.2, 1.4], [0.2, 2.7, 1.2], [4.0, 2.9, 1.7])
+    turned = ((0.0, 0.0), (90.0, 0.0), (0.0, 90.0))
+    lines = [
+        ArraySpec(f"line {k}", posed(line(0.1, 4), place_m, *angles), BAND_HZ)
+        for k, (place_m, angles) in enumerate(zip(places, turned, strict=True))
+    ]
+    features = judged(*(evidence_of(spec, 1.0) for spec in lines)).features
+    assert features.of_lines
+    assert features.crossing_deg == 0.0
+    mixed = judged(evidence_of(NORTH, 1.0), evidence_of(SOUTH, 1.0), evidence_of(lines[0], 1.0)).features
+    assert not mixed.of_lines
+    assert mixed.crossing_deg > 20.0
+    assert replace(features, of_lines=False).confidence >= features.confidence
 
 
 def test_one_array_with_a_clear_peak_is_not_sure() -> None:
@@ -107,7 +148,8 @@ def test_silence_is_refused_without_a_warning() -> None:
     silent = [replace(h, gcc=replace(h.gcc, values=np.zeros_like(h.gcc.values))) for h in (evidence_of(NORTH, 1.0),)]
     nothing = judged(*silent)
     assert nothing.refused is not None
-    assert nothing.features == ConfidenceFeatures(0.0, 0.0)
+    assert nothing.features == ConfidenceFeatures(0.0, 0.0, spread_m=nothing.features.spread_m)
+    assert nothing.features.spread_m == pytest.approx(float(np.max(GRID.upper_m - GRID.lower_m)), rel=0.9)
     assert np.isfinite(nothing.covariance_m2).all()
 
 

@@ -54,9 +54,9 @@ def run(samples: Float32Array, sizes: list[int] | None = None) -> list[Message]:
     while index < total:
         count = min(left.pop(0) if left else 480, total - index)
         block = Block(index, samples[:, index : index + count].copy(), START * FRAME_NS + index * 62_500)
-        messages += [message for cut in framer.push(block) for message in made.push(cut, framer)]
+        messages += [message for cut in framer.push(block) for message in made.push(cut, framer.state)]
         index += count
-    return messages + made.flush(framer)
+    return messages + made.flush(framer.state)
 
 
 def frame_indices(messages: list[Message], kind: type[Frame] | type[Mark]) -> list[int]:
@@ -110,8 +110,8 @@ def test_steady_noise_from_the_start_is_quiet() -> None:
     assert WARM_UP_FRAMES == 10
     framer, made = Framer(RATE_HZ), segmenter()
     cuts = framer.push(Block(0, sound([LOUD] * 2), START * FRAME_NS))
-    made.flush(framer)
-    assert [isinstance(message, Frame) for cut in cuts for message in made.push(cut, framer)] == [True, True]
+    made.flush(framer.state)
+    assert [isinstance(message, Frame) for cut in cuts for message in made.push(cut, framer.state)] == [True, True]
 
 
 def test_short_stream_gives_its_messages_at_its_end() -> None:
@@ -161,7 +161,7 @@ def test_mark_counts_the_losses_of_the_device() -> None:
         block = Block(
             index, samples[:, index : index + 400].copy(), START * FRAME_NS + index * 62_500, index == 400 * 5
         )
-        messages += [message for cut in framer.push(block) for message in made.push(cut, framer)]
+        messages += [message for cut in framer.push(block) for message in made.push(cut, framer.state)]
     mark = messages[-1]
     assert isinstance(mark, Mark)
     assert (mark.overflows, mark.lost_frames, mark.clock) == (1, 1, ClockState.LOCKED)
@@ -200,7 +200,7 @@ def test_recent_frames_can_be_requested() -> None:
     messages: list[Message] = []
     for k in range(samples.shape[1] // N):
         block = Block(k * N, samples[:, k * N : (k + 1) * N].copy(), (START + k) * FRAME_NS)
-        messages += [message for cut in framer.push(block) for message in made.push(cut, framer)]
+        messages += [message for cut in framer.push(block) for message in made.push(cut, framer.state)]
         if k == 30:
             asked = frames_of(made.backfill(START + 12, START + 21))
             assert [frame.frame_index - START for frame in asked] == list(range(12, 22))
@@ -226,5 +226,5 @@ def test_frames_before_a_gap_cannot_be_requested() -> None:
     for k in (*range(15), *range(18, 40)):
         block = Block(k * N, samples[:, k * N : (k + 1) * N].copy(), (START + k) * FRAME_NS)
         for cut in framer.push(block):
-            made.push(cut, framer)
+            made.push(cut, framer.state)
     assert [frame.frame_index - START for frame in frames_of(made.backfill(START, START + 25))] == list(range(18, 26))

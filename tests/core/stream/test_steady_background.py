@@ -49,9 +49,9 @@ def messages_of(samples: Float32Array, rate_hz: float) -> list[Message]:
     messages: list[Message] = []
     at = index = 0
     while (stop := round((index + 1) * 0.05 * rate_hz * 1.0001)) <= samples.shape[1]:
-        messages += segmenter.push(Cut(index, index * FRAME_NS, samples[:, at:stop]), framer)
+        messages += segmenter.push(Cut(index, index * FRAME_NS, samples[:, at:stop]), framer.state)
         at, index = stop, index + 1
-    return messages + segmenter.flush(framer)
+    return messages + segmenter.flush(framer.state)
 
 
 def active_runs(messages: list[Message]) -> list[tuple[int, int]]:
@@ -140,7 +140,8 @@ def test_the_spectrum_is_that_of_the_frame_with_a_hann_window(
     """At any rate, up to the highest bin, and for frames that are a sample longer or shorter than usual."""
     count = round(0.05 * rate_hz)
     samples = np.random.default_rng(seed).standard_normal((3, count + extra)).astype(np.float32)
-    found = SteadyBackground(rate_hz, (100.0, high_hz), 3.0, 0.95).spectrum(samples, scipy.fft.rfft(samples, axis=1))
+    background = SteadyBackground(rate_hz, (100.0, high_hz), 3.0, 0.95)
+    (found,) = background.spectra(samples[None], scipy.fft.rfft(samples[None], axis=2))
     fitted = np.pad(samples, ((0, 0), (0, 1)))[:, :count]
     window = scipy.signal.get_window("hann", count)
     spectra = np.abs(np.fft.rfft(fitted * window, axis=1)) ** 2
@@ -156,7 +157,7 @@ def test_without_hum_the_level_is_the_plain_power_in_the_band(level: float, seed
     background = SteadyBackground(rate_hz, BAND_HZ, 3.0, 0.95)
     for _ in range(70):
         samples = (level * rng.standard_normal((4, 800))).astype(np.float32)
-        spectrum = background.spectrum(samples, scipy.fft.rfft(samples, axis=1))
+        (spectrum,) = background.spectra(samples[None], scipy.fft.rfft(samples[None], axis=2))
         power = float(band_power(samples, rate_hz, BAND_HZ).mean())
         background.learn(spectrum)
         assert background.changing_power(spectrum, power) == power

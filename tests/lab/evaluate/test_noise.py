@@ -11,11 +11,14 @@ import soundfile
 
 from evaluate.small_campaign import RATE_HZ, write_sounds
 from livessl.cli.evaluate import add_arguments, evaluate
+from livessl.core.locate import confidence as confidence_of
+from livessl.core.locate.confidence import ConfidenceFeatures
 from livessl.lab.evaluate.campaign import run_campaign
 from livessl.lab.evaluate.job import Job, read_clips
 from livessl.lab.evaluate.localizer import METHODS
 from livessl.lab.evaluate.localizer_report import Columns, read_columns
 from livessl.lab.evaluate.noise import APART_M, FACING, WHERE, NoisePosition, NoiseSettings, where
+from livessl.lab.evaluate.noise_fit import noise_fit
 from livessl.lab.evaluate.noise_kinds import FROM_ONE_PLACE, KINDS, make_noise
 from livessl.lab.evaluate.noise_report import write_noise_report
 from livessl.lab.evaluate.noise_rooms import NOISE_ROOMS
@@ -144,6 +147,41 @@ def test_confidence_is_compared_with_the_truth(columns: Columns) -> None:
     assert only["confidence"] == pytest.approx(0.95)
     assert only["near"] == 0.0
     assert only["near_low"] == 0.0 < only["near_high"] < 0.4
+
+
+def test_a_fit_finds_the_constants_by_which_positions_were_right() -> None:
+    """Positions that are right as often as the confidence says, but for a tenth that another source begins."""
+    rng, count = np.random.default_rng(5), 6000
+    drawn = {
+        "margin": rng.uniform(0.0, 0.4, count),
+        "standing": rng.uniform(3.0, 9.0, count),
+        "crossing_deg": np.full(count, 60.0),
+        "second_array": rng.uniform(0.0, 3.0, count),
+        "background": np.zeros(count),
+        "beginning": np.where(rng.random(count) < 0.3, np.nan, rng.uniform(0.0, 4.0, count)),
+        "spread_m": rng.uniform(0.01, 0.5, count),
+    }
+    whole, of_lines = np.zeros(count, dtype=np.bool_), rng.random(count) < 0.2
+    confidence = [
+        ConfidenceFeatures(
+            float(drawn["margin"][row]),
+            float(drawn["standing"][row]),
+            float(drawn["crossing_deg"][row]),
+            float(drawn["second_array"][row]),
+            beginning=None if np.isnan(drawn["beginning"][row]) else float(drawn["beginning"][row]),
+            spread_m=float(drawn["spread_m"][row]),
+            of_lines=bool(of_lines[row]),
+        ).confidence
+        for row in range(count)
+    ]
+    right = rng.random(count) < 0.9 * np.array(confidence)
+    told = drawn | {"whole": whole, "of_lines": of_lines, "error_m": np.where(right, 0.1, 2.0)}
+    told |= {"share": np.ones(count), "method": np.full(count, "onset"), "sound": np.full(count, CLASSES[0])}
+    fit = noise_fit(told)
+    assert fit.elsewhere == pytest.approx(0.1, abs=0.03)
+    used = (confidence_of._BEGINNING_FIT, confidence_of._WEAK_FIT)
+    assert (fit.beginning, fit.weak) == pytest.approx(used, rel=0.25)
+    assert fit.lines_spread == pytest.approx(confidence_of._LINES_SPREAD_FIT, rel=0.25)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -19,6 +19,7 @@ from livessl.core.stream.final_pass import FinalResults
 from livessl.server.api.encode import JsonObject, Messages
 from livessl.server.app import Server
 from livessl.server.array_states import ArrayStates
+from livessl.server.clips.folder import ClipFolder
 from livessl.server.overload import Overload
 from livessl.site.tokens import Role, add_token
 from messages import START_NS, event_message, update_message
@@ -107,6 +108,7 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Desk]:
             "loud": {"events": {"min_level_dbfs": 0}, "armed": False},
         },
     )
+    ClipFolder(folder / "clips").put("small-past-3", _recordings)
     with pytest.MonkeyPatch.context() as patch, running_server(site) as server:
         patch.setattr(ArrayStates, "describe", _in_chosen_states(ArrayStates.describe))
         patch.setattr(Overload, "message", property(lambda _: "overloaded: it sheds some updates"))
@@ -152,9 +154,6 @@ def _fill(server: Server) -> None:
         event = {"id": f"small-past-{number}", "time_utc": utc_text(at_ns), "contributions": contributions, **kind}
         past.append((event_message(**event), at_ns))
     server.parts.store.add_all(past)
-    clips = server.parts.clips
-    assert clips is not None
-    clips.folder.put("small-past-3", _recordings)
     alerting = sound(1)
     server.parts.event_log.add_final(FinalResults((alerting,), after(alerting)), messages, {})
     wait_until(lambda: server.parts.alerts.outbox.dead(1), "the alert that was not delivered")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,8 +21,10 @@ from livessl.schema.alerts import OpenLinks
 from livessl.server.alerts.message import body, with_links
 from livessl.server.api.encode import JsonObject, Messages
 from livessl.server.app import Server
+from livessl.server.clips.folder import ClipFolder
 from livessl.server.signed_links import SignedLinks, Verdict
 from livessl.site.alert_models import LinksConfig
+from livessl.site.models import Site
 from livessl.site.tokens import Role, add_token
 from small_site import HANG_S, Changes, running_server, wait_until
 from webhook_receiver import Receiver, running_receiver
@@ -55,9 +58,7 @@ class Desk:
     def alert_about(self, number: int) -> JsonObject:
         """Let an event with a recording alert."""
         event = sound(number)
-        clips = self.server.parts.clips
-        assert clips is not None
-        clips.folder.put(event.id, _recording)
+        ClipFolder(self.folder / "clips").put(event.id, _recording)
         messages = Messages(self.server.parts.site, 0, utc=True)
         self.server.parts.event_log.add_final(FinalResults((event,), after(event)), messages, {})
         told = self.receiver.accepted
@@ -70,7 +71,18 @@ def _recording(folder: Path) -> JsonObject:
     return {"start_ns": NOW_NS, "files": [{"name": "enhanced.flac", "bytes": len(SOUND)}]}
 
 
-def linking_site(folder: Path, url: str, changes: Changes | None = None, **alerts: Any) -> Any:
+@contextmanager
+def running(site: Site) -> Iterator[Server]:
+    """Run a server, and wait until it has looked which recordings there are: it deletes those that are unfinished."""
+    ClipFolder(site.directory / "clips").put("small-0", _recording)
+    with running_server(site) as server:
+        clips = server.parts.clips
+        assert clips is not None
+        wait_until(lambda: clips.folder.count == 1, "the recordings that there are")
+        yield server
+
+
+def linking_site(folder: Path, url: str, changes: Changes | None = None, **alerts: Any) -> Site:
     return alert_site(
         folder,
         {
@@ -91,7 +103,7 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Desk]:
     with running_receiver() as receiver:
         links = {"of": ["picture", "clip"], "lifetime_s": 3600}
         site = linking_site(folder, receiver.url, {"server.http.tokens": "tokens.yaml"}, links=links)
-        with running_server(site) as server:
+        with running(site) as server:
             yield Desk(server, folder, receiver, tokens)
 
 
@@ -174,6 +186,7 @@ def test_roles_hold(desk: Desk) -> None:
     assert desk.ask(made["link"]).content == SOUND
     made = desk.ask("/api/v1/links", "POST", "operator", json={"path": "/api/v1/map"}).json()
     assert desk.status(f"{made['link']}&view=side") == 204  # nothing has been located yet
+    assert utc_ns(made["until_utc"]) - desk.server.parts.clock.now_ns() <= 600_000_000_000, "it shows what happens now"
     for path in ("/api/v1/access", "/metrics", "https://elsewhere/api/v1/map"):
         assert desk.ask("/api/v1/links", "POST", "operator", json={"path": path}).status_code == 422
 
@@ -197,7 +210,7 @@ def test_another_secret_ends_all_links_at_once(desk: Desk) -> None:
 
 
 def test_server_without_tokens_signs_nothing(tmp_path: Path) -> None:
-    with running_receiver() as receiver, running_server(linking_site(tmp_path, receiver.url)) as server:
+    with running_receiver() as receiver, running(linking_site(tmp_path, receiver.url)) as server:
         desk = Desk(server, tmp_path, receiver, {})
         alert = desk.alert_about(1)
         assert "links" not in alert

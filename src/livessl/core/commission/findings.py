@@ -10,6 +10,7 @@ import numpy as np
 from livessl.core.commission.alternative import Alternative
 from livessl.core.commission.diagnosis import Diagnosis, diagnose
 from livessl.core.commission.finding import LEAST_SOUNDS, Finding, Severity, in_order
+from livessl.core.commission.observe import LEAST_SHARPNESS
 from livessl.core.commission.places import Delays, Microphones, stacked
 from livessl.core.commission.set_up import DELAY_STD_S, Freedom, Known, careful
 from livessl.core.types import BoolArray, FloatArray, Observation
@@ -22,9 +23,6 @@ OF_SET_UP: Final = frozenset(
 EXACT_S: Final = 2e-6
 """Standard deviation, in seconds, of a delay whose pairs agree perfectly: converters and microphones differ by as
 much."""
-
-LEAST_SHARPNESS: Final = 3.5
-"""Sharpness below which an observation counts for nothing: noise alone gives up to 3."""
 
 MOST_SHARE: Final = 0.6
 """Share of the sounds in which a channel must show a fault."""

@@ -29,6 +29,9 @@ INVERSION: Final = 1.15
 """Ratio by which the peaks must be higher with some microphones inverted than with none: reverberation alone gives
 some pairs a deeper trough than a peak."""
 
+LEAST_SHARPNESS: Final = 3.5
+"""Sharpness below which an observation counts for nothing: noise alone gives up to 3."""
+
 
 def receive(evidence: Evidence, segments: Iterable[Float32Array]) -> Received:
     """Keep what `observe` needs of an array's evidence and of its samples, segments of (K, n)."""

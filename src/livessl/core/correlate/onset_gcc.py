@@ -128,6 +128,11 @@ def summed(parts: Sequence[OnsetGCC]) -> OnsetGCC:
     return OnsetGCC(lags, levels, sum(one.noise_power for one in parts))
 
 
+def has_long_windows(largest_delay_s: float) -> bool:
+    """Return whether windows are longer than `WINDOW_S` where sound takes this long between microphones, in seconds."""
+    return _WINDOW_LAGS * largest_delay_s > WINDOW_S
+
+
 class OnsetFrontEnd:
     """Computes the onset GCC of one array at one sampling rate, frame after frame.
 

@@ -6,6 +6,7 @@ It sees correlations and no sound. The constants were fitted to simulated events
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
@@ -15,6 +16,7 @@ import numpy as np
 from livessl.core.geometry import Grid, pair_weight
 from livessl.core.locate import refine
 from livessl.core.locate.srp import PairTerms, SRPFunctional
+from livessl.core.mirror import flatness
 from livessl.core.types import ArraySpec, Candidate, Evidence, FloatArray
 
 NEAR_M: Final = 0.5
@@ -43,6 +45,21 @@ _BACKGROUND_FIT: Final = 36.6
 _BACKGROUND_RMS: Final = 2.5
 """Power of a background at a position, relative to its root mean square elsewhere, that is there by chance: it is known
 from some tenths of a second, and the position is where the background adds to the sound."""
+
+_BEGINNING_FIT: Final = 9.2
+"""Log-odds by which a beginning that has nothing at the position lowers the confidence. This constant and the next
+two that end in `_FIT` are fitted as `_BACKGROUND_FIT` is."""
+
+_BEGUN: Final = 0.4
+"""Peak-to-RMS ratio of a beginning, relative to that of the whole sound, from which on it lacks nothing."""
+
+_WEAK_FIT: Final = 1.5
+"""Log-odds lost for each unit of the peak-to-RMS ratio by which the second array falls short of `CLEAR_PEAK_TO_RMS`,
+where lines of sight that cross determine the distance: one of them is then little better than noise."""
+
+_LINES_SPREAD_FIT: Final = 10.0
+"""Factor on the standard deviation along the position's least certain axis where all arrays are lines: three of them
+give as many angles as there are coordinates, with none to spare. The share of errors beyond `NEAR_M` is then normal."""
 
 _LEAST_LOG_ODDS: Final = -100.0
 """Log-odds below which a probability is 0 for every purpose; a background may be any number of times the power."""
@@ -96,6 +113,12 @@ class ConfidenceFeatures:
     background : float
         Share of the power at the position that the background, if it went on as it was before the sound, would have
         there above what it may have by chance; 0 if that is not known.
+    beginning : float or None
+        `peak_to_rms` of the frames in which the sound begins; None if they are not known.
+    spread_m : float
+        Greatest standard deviation of the position, metres, that its covariance gives.
+    of_lines : bool
+        Whether the microphones of each array lie on a line, so that no array alone gives a direction.
     """
 
     margin: float
@@ -105,6 +128,9 @@ class ConfidenceFeatures:
     whole: bool = False
     share: float = 1.0
     background: float = 0.0
+    beginning: float | None = None
+    spread_m: float = 0.0
+    of_lines: bool = False
 
     @property
     def confidence(self) -> float:
@@ -114,17 +140,38 @@ class ConfidenceFeatures:
     @property
     def confidence_of_candidates(self) -> float:
         """Probability that the position or a place that explains the evidence as well is right to within `NEAR_M`."""
+        near = self.confidence_at_known_distance * self.share_of_near_peaks
         if self.crossing_deg >= CROSSING_DEG:
-            return self.confidence_at_known_distance
+            return near
         intercept, of_margin = _DISTANCE_FIT
-        return self.confidence_at_known_distance * _probability(intercept + of_margin * self.margin)
+        return near * _probability(intercept + of_margin * self.margin)
+
+    @property
+    def share_of_near_peaks(self) -> float:
+        """Share of right peaks that are nearer than `NEAR_M`; of other arrays than lines all are."""
+        if not self.of_lines:
+            return 1.0
+        return math.erf(NEAR_M / (math.sqrt(2.0) * _LINES_SPREAD_FIT * max(self.spread_m, 1e-9)))
+
+    @property
+    def weakness(self) -> float:
+        """How much the second array falls short of a clear peak, where its line of sight determines the distance."""
+        return max(0.0, CLEAR_PEAK_TO_RMS - self.second_array) if self.crossing_deg >= CROSSING_DEG else 0.0
+
+    @property
+    def lacking(self) -> float:
+        """How much of the peak is missing where the sound begins, 0 to 1; 0 if the beginning is not known."""
+        if self.beginning is None or self.peak_to_rms <= 0.0:
+            return 0.0
+        return max(0.0, 1.0 - self.beginning / (_BEGUN * self.peak_to_rms))
 
     @property
     def confidence_at_known_distance(self) -> float:
         """Probability that the position is right to within `NEAR_M` if the arrays determine its distance."""
         intercept, of_margin, of_ratio = _WHOLE_SEGMENT_FIT if self.whole else _ONSET_FIT
         log_odds = intercept + of_margin * self.margin + of_ratio * self.peak_to_rms
-        return _probability(log_odds - _BACKGROUND_FIT * self.background)
+        lost = _BACKGROUND_FIT * self.background + _BEGINNING_FIT * self.lacking + _WEAK_FIT * self.weakness
+        return _probability(log_odds - lost)
 
     @property
     def is_sure(self) -> bool:
@@ -220,21 +267,25 @@ def judge(
     """
     terms = functional.pair_terms(position_m)
     ratios = sorted(peak_to_rms(part, array_power(part, term)) for part, term in zip(evidence, terms, strict=True))
-    features = ConfidenceFeatures(
-        refine.margin(power, rival_power),
-        sum(ratios),
-        crossing_deg([part.spec for part in evidence], position_m),
-        ratios[-2] if len(ratios) > 1 else 0.0,
-        whole,
-        1.0 if rivals is None else rivals.share,
-        _background_share(evidence, position_m, power, functional.c_m_s),
-    )
     covariance_m2 = refine.laplace_covariance_m2(functional, evidence, position_m, grid)
     covariance_m2 *= _INFLATION * np.sqrt(len(evidence))
     covariance_m2 *= min(1.0, _residual_misfit(evidence, terms, len(grid.free_axes)) / _CALIBRATED_MISFIT) ** 2
     covariance_m2 += refine.placement_covariance_m2(functional, position_m, _PLACED_M, grid)
     for axis in grid.free_axes:
         covariance_m2[axis, axis] += _LEAST_DEVIATION_M**2
+    sighting = [part.spec for part in evidence if _has_line_of_sight(part.spec, grid, functional.c_m_s)]
+    features = ConfidenceFeatures(
+        refine.margin(power, rival_power),
+        sum(ratios),
+        crossing_deg(sighting, position_m),
+        ratios[-2] if len(ratios) > 1 else 0.0,
+        whole,
+        1.0 if rivals is None else rivals.share,
+        _background_share(evidence, position_m, power, functional.c_m_s),
+        _beginning(evidence, position_m, functional.c_m_s),
+        float(np.sqrt(max(0.0, np.linalg.eigvalsh(covariance_m2)[-1]))),
+        not sighting,
+    )
     if rivals is not None:
         covariance_m2 += rivals.spread_m2
     ambiguous = rivals is not None and rivals.is_ambiguous
@@ -269,6 +320,21 @@ def _background_share(evidence: Sequence[Evidence], position_m: FloatArray, powe
     return max(0.0, there - _BACKGROUND_RMS * rms) / power
 
 
+def _beginning(evidence: Sequence[Evidence], position_m: FloatArray, c_m_s: float) -> float | None:
+    """Peak-to-RMS ratio at a position of the frames in which the sound begins; None if they are not known."""
+    known = [part.beginning for part in evidence if part.beginning is not None]
+    if not known:
+        return None
+    terms = SRPFunctional(known, c_m_s).pair_terms(position_m)
+    return sum(peak_to_rms(part, array_power(part, term)) for part, term in zip(known, terms, strict=True))
+
+
+def _has_line_of_sight(spec: ArraySpec, grid: Grid, c_m_s: float) -> bool:
+    """Return whether an array alone gives a line of sight; microphones on a line give a cone, except in a plane."""
+    flat = flatness([spec], c_m_s)
+    return flat is None or not flat.is_line or len(grid.free_axes) < 3
+
+
 def _residual_misfit(evidence: Sequence[Evidence], terms: Sequence[PairTerms], axes: int) -> float:
     """Disagreement of the pairs about a position with `axes` free coordinates, as a share of the noise; 0 to 1.
 
@@ -292,7 +358,9 @@ def _residual_misfit(evidence: Sequence[Evidence], terms: Sequence[PairTerms], a
 
 
 def crossing_deg(specs: Sequence[ArraySpec], position_m: FloatArray) -> float:
-    """Largest angle at which lines from two arrays' centres cross at a position, 0 to 90 degrees; 0 for one array."""
+    """Largest angle at which lines from two arrays' centres cross at a position, 0 to 90 degrees; 0 without two."""
+    if len(specs) < 2:
+        return 0.0
     lines = np.stack([position_m - spec.centre_m for spec in specs])
     lines /= np.maximum(np.linalg.norm(lines, axis=1, keepdims=True), 1e-9)
     return float(np.degrees(np.arccos(np.clip(np.abs(lines @ lines.T).min(), 0.0, 1.0))))

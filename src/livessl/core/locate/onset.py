@@ -9,10 +9,17 @@ from typing import Final
 import numpy as np
 
 from livessl.core.correlate.gcc_phat import LagSampling, require_band
-from livessl.core.correlate.onset_gcc import OnsetFrontEnd, summed
+from livessl.core.correlate.onset_gcc import OnsetFrontEnd, OnsetGCC, has_long_windows, summed
 from livessl.core.geometry import Grid, microphone_pairs
 from livessl.core.locate import ambiguity, outliers
-from livessl.core.locate.confidence import CROSSING_DEG, LEAST_CONFIDENCE, NEAR_M, Judgement, background_power
+from livessl.core.locate.beginning import beginning, first_frame
+from livessl.core.locate.confidence import (
+    CROSSING_DEG,
+    LEAST_CONFIDENCE,
+    NEAR_M,
+    Judgement,
+    background_power,
+)
 from livessl.core.locate.contributing import FAINT, NO_EVIDENCE, contributing
 from livessl.core.locate.estimator import Localization, Sound, strongest_onsets
 from livessl.core.locate.frame_gccs import BEGINNING, FrameGCCs
@@ -42,6 +49,14 @@ MOST_ARRAYS_REEXAMINED: Final = 8
 BACKGROUND: Final = 0.05
 """Share of the power at a position that the background has there beyond chance, from which on the background is
 subtracted and the sound is looked for beneath it."""
+
+
+BEGAN: Final = 0.8
+"""Peak-to-RMS ratio of the beginning of a sound at a position, relative to that of the whole sound, below which the
+place of the beginning is looked for: 15 % of the right positions of the development half."""
+
+LEAD: Final = 1.0
+"""Peak-to-RMS ratio by which the beginning must be clearer at its own place than at another one to be preferred."""
 
 
 FAR_BELOW: Final = 0.05
@@ -130,6 +145,7 @@ class Onset(MapEstimator):
             other = self._answer(beneath, suspect, tolerance=looks_again)
             if other.refused is None and other.rank() > answer.rank():
                 evidence, answer = beneath, other
+        answer = self._by_beginning(answer, suspect)
         outside = self._outside(answer)
         separation = None
         if outside is None or not outside.is_sufficient:
@@ -152,9 +168,24 @@ class Onset(MapEstimator):
         power = None if separation is None else separation.power
         return replace(found, unneeded=sounds.keys() - answer.contributing, others=others, power=power)
 
+    def _by_beginning(self, answer: _Answer, suspect: Collection[str]) -> _Answer:
+        """Return the place from which a sound began, if that is clear and an answer is elsewhere.
+
+        From the place of the answer little or nothing came when the sound began: it is that of another source.
+        """
+        features = answer.judgement.features
+        parts = tuple(part.beginning for part in answer.evidence if part.beginning is not None)
+        if not parts or features.beginning is None or features.beginning >= BEGAN * features.peak_to_rms:
+            return answer
+        other = self._answer(parts, suspect)
+        apart_m = np.linalg.norm(other.consensus.place.position_m - answer.consensus.place.position_m)
+        lead = other.judgement.features.peak_to_rms - features.beginning
+        return other if other.refused is None and apart_m > NEAR_M and lead > LEAD else answer
+
     def evidence(self, sounds: Mapping[str, Sound]) -> tuple[Evidence, ...]:
         """Sum each array's onset GCCs; the evidence is in the order of the arrays' names."""
-        return tuple(self._onset_evidence(name, sounds[name]) for name in sorted(sounds))
+        first = first_frame(sounds)
+        return tuple(self._onset_evidence(name, sounds[name], first) for name in sorted(sounds))
 
     def _answer(
         self, evidence: tuple[Evidence, ...], suspect: Collection[str], *, whole: bool = False, tolerance: bool = True
@@ -279,20 +310,31 @@ class Onset(MapEstimator):
         live = np.any(evidence.gcc.values, axis=1)
         return FrameGCCs.of(evidence.spec, sampling, sound.onsets, live, sound.course)
 
-    def _onset_evidence(self, array: str, sound: Sound) -> Evidence:
-        if sound.onsets:
-            onsets = summed(sound.onsets)
-        else:
+    def _onset_evidence(self, array: str, sound: Sound, first: int | None) -> Evidence:
+        """Return the evidence of an array's sound; its beginning is around a frame index."""
+        if not sound.onsets:
             onsets = self.onset_front_end(array, sound.sample_rate_hz).push_segments(sound.segments)
+            return self._evidence_of(array, sound, onsets, None)
+        evidence = self._evidence_of(array, sound, summed(sound.onsets), _background(sound))
+        is_wide = has_long_windows(self.arrays[array].aperture_m / self.c_m_s)  # as long as a beginning
+        begun = None if is_wide else beginning(sound, first)
+        if begun is None:
+            return evidence
+        parts = sound.onsets[begun]
+        own = self._evidence_of(array, sound, summed(parts), _background(sound, len(parts)))
+        return replace(evidence, beginning=own)
+
+    def _evidence_of(self, array: str, sound: Sound, onsets: OnsetGCC, background: Float32Array | None) -> Evidence:
+        """Return the evidence of some onsets of an array's sound, with the lags of the background among them."""
         sampling = self._sampling(array, sound.sample_rate_hz)
         spec = self.arrays[array]
         pairs = microphone_pairs(len(spec.microphones_m))
         gcc = GCC(pairs, sampling.fine_lags_s, sampling.fine(onsets.lags / onsets.heights(pairs)))
         faint = onsets.noise_power <= FAINT * onsets.weight
-        presumed = sound.detected and faint
-        kept, background = sound.without_dead_channels(gcc), _background(sound)
+        kept = sound.without_dead_channels(gcc)
         if background is not None:
             background = sampling.fine(background / onsets.heights(pairs)) * np.any(kept.values, axis=1)[:, None]
+        presumed = sound.detected and faint
         return Evidence(spec, kept, noise_rms=onsets.noise_rms, is_presumed=presumed, background=background)
 
     def _sampling(self, array: str, sample_rate_hz: float) -> LagSampling:
@@ -307,8 +349,10 @@ class Onset(MapEstimator):
         return sampling
 
 
-def _background(sound: Sound) -> Float32Array | None:
-    """Lags that the frames of a sound would add up to if its background had gone on alone; None if it is not known.
+def _background(sound: Sound, frames: int | None = None) -> Float32Array | None:
+    """Lags that frames of a sound would add up to if its background had gone on alone; None if it is not known.
+
+    `frames` is their number; None for all from the beginning of the sound on.
 
     The background is known from the pre-roll without its last frames, in which the sound may begin. The weights of
     onsets say little about power, so that a background `FAR_BELOW` the sound is left out. Envelopes are magnitudes:
@@ -325,7 +369,7 @@ def _background(sound: Sound) -> Float32Array | None:
     counted = min(1.0, (level - FAR_BELOW) / (COMPARABLE - FAR_BELOW))
     if counted <= 0.0:
         return None
-    share = counted * (len(sound.onsets) - before) / len(known)
+    share = counted * (frames or len(sound.onsets) - before) / len(known)
     return np.float32(share) * np.asarray(summed([sound.onsets[k] for k in known]).lags, dtype=np.float32)
 
 

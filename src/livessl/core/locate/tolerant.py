@@ -46,7 +46,10 @@ def tolerant(evidence: Evidence) -> Evidence:
     frequencies_hz = np.linspace(*spec.band_hz, 64)
     passed = np.exp(-np.square(2.0 * np.pi * frequencies_hz * width_s))  # power of noise that is left
     noise_rms = evidence.noise_rms * float(np.sqrt(passed.mean()))
-    return replace(evidence, gcc=replace(gcc, values=values), noise_rms=noise_rms, background=background)
+    beginning = None if evidence.beginning is None else tolerant(evidence.beginning)
+    return replace(
+        evidence, gcc=replace(gcc, values=values), noise_rms=noise_rms, background=background, beginning=beginning
+    )
 
 
 def _averaged(values: Float32Array, weights: FloatArray) -> Float32Array:

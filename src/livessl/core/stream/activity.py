@@ -97,15 +97,17 @@ class CausalActivity:
         self._maximum = 0.0
         self._latest: deque[float] = deque(maxlen=_FLOOR_SMOOTHING)
         self._smoothed: deque[float] = deque(maxlen=max(1, round(parameters.floor_window_s / FRAME_S)))
+        self._floor_power = 0.0  # the least of them
 
     @property
     def floor_power(self) -> float:
         """The background, full scale squared; 0 before the first frame."""
-        return min(self._smoothed, default=0.0)
+        return self._floor_power
 
     def prime(self, floor_power: float) -> None:
         """Start from a known background, full scale squared."""
         self._smoothed.append(floor_power)
+        self._floor_power = min(self._smoothed)
 
     def restart(self, floor_power: float, maximum: float) -> None:
         """Start over, because part of the power is no longer counted, from a background and a decaying maximum.
@@ -124,4 +126,5 @@ class CausalActivity:
         reference = max(self._maximum, parameters.least_power(self.floor_power) / parameters.threshold)
         self._latest.append(power)
         self._smoothed.append(sum(self._latest) / len(self._latest))
-        return bool(is_active(np.asarray(power), reference, parameters.threshold))
+        self._floor_power = min(self._smoothed)
+        return bool(power >= parameters.threshold * reference and power > 0.0)  # `is_active` of one frame

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from livessl.core.stream.activity import ActivityParameters
 from livessl.core.stream.level_reports import LevelReports
-from livessl.core.stream.segmenter import Segmenter
-from livessl.core.stream.timeline import Framer
+from livessl.core.stream.segmenter import Measured, Segmenter
+from livessl.core.stream.timeline import Cut, Framer, FramerState
 from livessl.core.types import ArraySpec, BackfillRequest, Block, IntArray, Mark, Message
 
 
@@ -63,13 +63,25 @@ class Pipeline:
 
     def push(self, block: Block) -> list[Message]:
         """Return the messages that a block completes."""
-        messages: list[Message] = []
-        for cut in self.framer.push(block):
-            if self._levels is not None:
-                self._levels.push(cut.samples)
-            for segmenter in self._segmenters:
-                messages += map(self._with_levels, segmenter.push(cut, self.framer))
+        (messages,) = self.push_several([block])
         return messages
+
+    def push_several(self, blocks: Sequence[Block]) -> list[list[Message]]:
+        """Return the messages that each of some blocks completes; their frames are measured together, which is faster.
+
+        Marks with levels report the drift of the clock after the last block.
+        """
+        cut = [(self.framer.push(block), self.framer.state) for block in blocks]
+        frames = [frame for some, _ in cut for frame in some]
+        measured = [iter(segmenter.measure(frames)) for segmenter in self._segmenters]
+        return [[message for frame in some for message in self._taken(frame, measured, state)] for some, state in cut]
+
+    def _taken(self, cut: Cut, measured: Sequence[Iterator[Measured]], state: FramerState) -> Iterator[Message]:
+        """Yield the messages that a frame completes; each iterator yields what an array's segmenter measured of it."""
+        if self._levels is not None:
+            self._levels.push(cut.samples)
+        for segmenter, known in zip(self._segmenters, measured, strict=True):
+            yield from map(self._with_levels, segmenter.take(cut, next(known), state))
 
     def backfill(self, request: BackfillRequest) -> list[Message]:
         """Return the remembered frames that a request names; none where the array is on another device."""
@@ -91,4 +103,4 @@ class Pipeline:
 
     def flush(self) -> list[Message]:
         """Return the messages held back, at the end of the sound."""
-        return [message for segmenter in self._segmenters for message in segmenter.flush(self.framer)]
+        return [message for segmenter in self._segmenters for message in segmenter.flush(self.framer.state)]

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import groupby
 from typing import Final
 
 import numpy as np
@@ -11,7 +14,7 @@ import scipy
 from livessl.core.correlate.band import spectrum_power
 from livessl.core.stream.activity import ActivityParameters, CausalActivity
 from livessl.core.stream.steady_background import SteadyBackground
-from livessl.core.stream.timeline import Cut, Framer
+from livessl.core.stream.timeline import Cut, FramerState
 from livessl.core.types import FRAME_S, ArraySpec, Float32Array, FloatArray, Frame, IntArray, Mark, Message
 
 RECENT_S: Final = 12.0
@@ -20,6 +23,25 @@ event, its pre-roll and the way of a backfill request together."""
 
 WARM_UP_FRAMES: Final = 10
 """Number of frames held back at the start; the quietest of them is the first estimate of the background."""
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """What is measured of one frame of an array, whatever came before it.
+
+    Parameters
+    ----------
+    channel_power : (K,) float64
+        In-band mean power of each channel, full scale squared.
+    power : float
+        Their mean.
+    spectrum : (F,) float64
+        Power in each bin: see `SteadyBackground.spectra`.
+    """
+
+    channel_power: FloatArray
+    power: float
+    spectrum: FloatArray
 
 
 class Segmenter:
@@ -53,7 +75,7 @@ class Segmenter:
         self._activity = CausalActivity(parameters)
         self._background = SteadyBackground(sample_rate_hz, spec.band_hz, parameters.floor_window_s, parameters.keep)
         self._hang_over = parameters.hang_over_frames
-        self._warm_up: list[tuple[Cut, FloatArray, FloatArray]] | None = []
+        self._warm_up: list[tuple[Cut, Measured]] | None = []
         self._pre_roll: deque[tuple[Cut, float]] = deque(maxlen=parameters.pre_roll_frames)
         self._recent: deque[tuple[Cut, float]] = deque(maxlen=round(RECENT_S / FRAME_S))
         self._quiet_frames = self._hang_over + 1
@@ -65,34 +87,50 @@ class Segmenter:
         """Name of the array."""
         return self._spec.name
 
-    def push(self, cut: Cut, framer: Framer) -> list[Message]:
-        """Take in the next frame of the device; `framer` holds the counters and the clock state that marks carry."""
+    def measure(self, cuts: Sequence[Cut]) -> list[Measured]:
+        """Measure some frames. Those that follow each other and are equally long are transformed together."""
+        measured: list[Measured] = []
+        for _, alike in groupby(cuts, key=lambda cut: cut.samples.shape[1]):
+            samples = np.stack([self._selected(cut) for cut in alike])
+            count, channels, length = samples.shape
+            plain = scipy.fft.rfft(samples.reshape(count * channels, length), axis=1)
+            power = spectrum_power(plain, length, self._rate_hz, self._spec.band_hz).reshape(count, channels)
+            spectra = self._background.spectra(samples, plain.reshape(count, channels, -1))
+            measured += map(Measured, power, power.mean(axis=1).tolist(), spectra)
+        return measured
+
+    def push(self, cut: Cut, state: FramerState) -> list[Message]:
+        """Take in the next frame of the device; `state` is that of its framer, which marks report."""
+        (measured,) = self.measure([cut])
+        return self.take(cut, measured, state)
+
+    def take(self, cut: Cut, measured: Measured, state: FramerState) -> list[Message]:
+        """Take in the next frame of the device, which has been measured: see `push`."""
         if self._frame_index is not None and cut.frame_index != self._frame_index + 1:
             self._pre_roll.clear()  # frames before a gap are no pre-roll of a sound after it
             self._recent.clear()
             self._quiet_frames = self._hang_over + 1
         self._frame_index = cut.frame_index
-        samples = self._selected(cut)
-        plain = scipy.fft.rfft(samples, axis=1)
-        power = spectrum_power(plain, samples.shape[1], self._rate_hz, self._spec.band_hz)
-        spectrum, mean = self._background.spectrum(samples, plain), float(power.mean())
-        found_hum = self._background.learn(spectrum)
+        found_hum = self._background.learn(measured.spectrum)
         if self._warm_up is None:
             if found_hum:
                 self._activity.restart(self._background.usual_power, self._background.changing_maximum)
-            level = self._background.changing_power(spectrum, mean)
-            return self._decide(cut, power, level, framer)
-        self._warm_up.append((cut, power, spectrum))
-        return self.flush(framer) if len(self._warm_up) >= WARM_UP_FRAMES else []
+            level = self._background.changing_power(measured.spectrum, measured.power)
+            return self._decide(cut, measured, level, state)
+        self._warm_up.append((cut, measured))
+        return self.flush(state) if len(self._warm_up) >= WARM_UP_FRAMES else []
 
-    def flush(self, framer: Framer) -> list[Message]:
+    def flush(self, state: FramerState) -> list[Message]:
         """End the warm-up, as the end of a short stream must."""
         held, self._warm_up = self._warm_up or [], None
-        levels = [self._background.changing_power(spectrum, float(power.mean())) for _, power, spectrum in held]
+        levels = [self._background.changing_power(known.spectrum, known.power) for _, known in held]
         if held:
             self._activity.prime(min(levels))
-        known = zip(held, levels, strict=True)
-        return [message for (cut, power, _), level in known for message in self._decide(cut, power, level, framer)]
+        return [
+            message
+            for (cut, known), level in zip(held, levels, strict=True)
+            for message in self._decide(cut, known, level, state)
+        ]
 
     def backfill(self, first: int, last: int) -> list[Message]:
         """Return the remembered frames from `first` to `last`, both included, whether or not they were sent."""
@@ -101,13 +139,13 @@ class Segmenter:
     def _selected(self, cut: Cut) -> Float32Array:
         return cut.samples[self._channels]
 
-    def _decide(self, cut: Cut, channel_power: FloatArray, power: float, framer: Framer) -> list[Message]:
+    def _decide(self, cut: Cut, measured: Measured, power: float, state: FramerState) -> list[Message]:
         self._recent.append((cut, power))
         active = self._activity.push(power)
         self._quiet_frames = 0 if active else self._quiet_frames + 1
         if self._quiet_frames > self._hang_over:
             self._pre_roll.append((cut, power))
-            return [self._mark(cut, channel_power, framer)]
+            return [self._mark(cut, measured, state)]
         messages: list[Message] = [self._next_frame(earlier, level, False) for earlier, level in self._pre_roll]
         self._pre_roll.clear()
         messages.append(self._next_frame(cut, power, active))
@@ -122,16 +160,16 @@ class Segmenter:
         samples, name = np.ascontiguousarray(self._selected(cut)), self._spec.name
         return Frame(name, 0, cut.frame_index, cut.time_ns, self._rate_hz, samples, power, active=False, requested=True)
 
-    def _mark(self, cut: Cut, channel_power: FloatArray, framer: Framer) -> Mark:
+    def _mark(self, cut: Cut, measured: Measured, state: FramerState) -> Mark:
         return Mark(
             array=self._spec.name,
             sequence=self._sequence,
             frame_index=cut.frame_index,
-            power=float(channel_power.mean()),
+            power=measured.power,
             noise_power=self._activity.floor_power,
-            channel_power=tuple(float(power) for power in channel_power),
-            overflows=framer.overflows,
-            lost_frames=framer.lost_frames,
-            drift_ppm=framer.timeline.drift_ppm,
-            clock=framer.timeline.state,
+            channel_power=tuple(measured.channel_power.tolist()),
+            overflows=state.overflows,
+            lost_frames=state.lost_frames,
+            drift_ppm=state.drift_ppm,
+            clock=state.clock,
         )

@@ -11,6 +11,7 @@ power in the band.
 from __future__ import annotations
 
 from collections import deque
+from itertools import islice
 from typing import Final
 
 import numpy as np
@@ -67,7 +68,6 @@ class SteadyBackground:
         self._band = slice(*band_bins(self._count, sample_rate_hz, band_hz))
         bins = min(self._count // 2 + 1, round(BEYOND * self._band.stop))
         self._bins = slice(0, bins)
-        self._zero = np.zeros(bins)
         self._latest: deque[FloatArray] = deque(maxlen=_SMOOTHING)
         self._blocks: deque[FloatArray] = deque(maxlen=max(1, round(window_s / FRAME_S / _BLOCK) - 1))
         self._of_blocks: FloatArray | None = None  # the least of all of them
@@ -75,26 +75,27 @@ class SteadyBackground:
         self._sum: FloatArray | None = None
         self._means: deque[FloatArray] = deque(maxlen=self._blocks.maxlen)
         self._frames = 0
-        self._loud: BoolArray = np.zeros(bins, dtype=np.bool_)
+        self._loud: BoolArray = np.zeros(bins, dtype=np.bool_)  # another array only where other bins are loud
+        self._is_any_loud = False
         self._usual: FloatArray = np.zeros(bins)
         self._maximum: FloatArray = np.zeros(bins)
 
-    def spectrum(self, samples: Float32Array, plain: ComplexArray) -> FloatArray:
-        """Return the power of a frame in each bin, mean over the channels, full scale squared: (F,).
+    def spectra(self, samples: Float32Array, plain: ComplexArray) -> FloatArray:
+        """Return the power of some frames in each bin, mean over the channels, full scale squared: (C, F).
 
         Parameters
         ----------
-        samples : (K, n) float32
-        plain : (K, n // 2 + 1) complex64
-            Its spectra without a window, from which those with one follow: the window is a constant and one cosine.
+        samples : (C, K, n) float32
+        plain : (C, K, n // 2 + 1) complex64
+            Their spectra without a window, from which those with one follow: the window is a constant and one cosine.
         """
-        if samples.shape[1] == self._count:
+        if samples.shape[2] == self._count:
             spectra = _windowed(plain, self._bins.stop, self._count)
         else:
-            frame = samples[:, : self._count]
-            spectra = scipy.fft.rfft(frame * self._window[: frame.shape[1]], self._count, axis=1)[:, self._bins]
-        power = np.add.reduce(spectra.real**2 + spectra.imag**2, axis=0, dtype=np.float64)
-        return np.asarray(power * (self._scale / len(samples)))
+            frames = samples[:, :, : self._count]
+            spectra = scipy.fft.rfft(frames * self._window[: frames.shape[2]], self._count, axis=2)[:, :, self._bins]
+        power = np.add.reduce(spectra.real**2 + spectra.imag**2, axis=1, dtype=np.float64)
+        return np.asarray(power * (self._scale / samples.shape[1]))
 
     def learn(self, spectrum: FloatArray) -> bool:
         """Take in the spectrum of the next frame; return whether it shows a hum that was not known before.
@@ -111,15 +112,17 @@ class SteadyBackground:
         self._latest.append(spectrum)
         if len(self._latest) < _SMOOTHING:
             return
-        smoothed = sum(self._latest, start=self._zero) / _SMOOTHING
+        smoothed = sum(islice(self._latest, 1, None), start=self._latest[0]) / _SMOOTHING
         self._least = smoothed if self._least is None else np.minimum(self._least, smoothed)
         self._sum = smoothed if self._sum is None else self._sum + smoothed
         self._frames += 1
         background = self._least if self._of_blocks is None else np.minimum(self._of_blocks, self._least)
         inside = background[self._band]
         if len(inside) >= _LEAST_BINS:
-            self._loud = background > LOUD * _median(inside)
-            self._loud[0] = False
+            loud = background > LOUD * _median(inside)
+            loud[0] = False
+            if (loud != self._loud).any():
+                self._loud, self._is_any_loud = loud, bool(loud.any())
         if self._frames % _BLOCK == 0:
             self._blocks.append(self._least)
             self._of_blocks = np.minimum.reduce(list(self._blocks))
@@ -154,7 +157,7 @@ class SteadyBackground:
         power : float
             The plain power in the band, which is returned if nothing is loud.
         """
-        if not self._loud.any():
+        if not self._is_any_loud:
             return power
         inside, loud = spectrum[self._band], self._loud[self._band]
         excess = np.maximum(inside - EXCESS * self._usual[self._band], 0.0)
@@ -162,10 +165,12 @@ class SteadyBackground:
 
 
 def _windowed(plain: ComplexArray, bins: int, count: int) -> ComplexArray:
-    """Return the first bins of the spectra of `count` samples with a Hann window, from those without one (K, F)."""
-    above = plain[:, bins : bins + 1] if bins < plain.shape[1] else np.conj(plain[:, count - bins : count - bins + 1])
-    around = np.concatenate([np.conj(plain[:, 1:2]), plain[:, :bins], above], axis=1)
-    return np.asarray(0.5 * around[:, 1:-1] - 0.25 * (around[:, :-2] + around[:, 2:]))
+    """Return the first bins of the spectra of `count` samples with a Hann window, from those without one (C, K, F)."""
+    above = plain[..., bins : bins + 1]
+    if not above.size:
+        above = np.conj(plain[..., count - bins : count - bins + 1])
+    around = np.concatenate([np.conj(plain[..., 1:2]), plain[..., :bins], above], axis=-1)
+    return np.asarray(0.5 * around[..., 1:-1] - 0.25 * (around[..., :-2] + around[..., 2:]))
 
 
 def _median(values: FloatArray) -> float:

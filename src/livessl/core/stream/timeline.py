@@ -146,6 +146,16 @@ class Cut:
     samples: Float32Array
 
 
+@dataclass(frozen=True, slots=True)
+class FramerState:
+    """What marks report of a framer: its counters, and the drift and state of its clock."""
+
+    overflows: int
+    lost_frames: int
+    drift_ppm: float
+    clock: ClockState
+
+
 class Framer:
     """Cuts a device's blocks on the grid of 50 ms; frames are contiguous, now and then a sample longer.
 
@@ -163,6 +173,11 @@ class Framer:
         self._parts: list[Float32Array] = []
         self._begin = self._end = 0
         self._frame_index: int | None = None
+
+    @property
+    def state(self) -> FramerState:
+        """Counters and clock after the last block."""
+        return FramerState(self.overflows, self.lost_frames, self.timeline.drift_ppm, self.timeline.state)
 
     def push(self, block: Block) -> list[Cut]:
         """Take in a block; return the frames it completes. A gap drops the frame that it tears."""

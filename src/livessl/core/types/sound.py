@@ -309,6 +309,8 @@ class Evidence:
     background : (P, L) float32, or None
         What `gcc.values` would be of a background alone that went on as it was before the sound; None if that is not
         known.
+    beginning : Evidence or None
+        Evidence of the frames in which the sound begins, alone; None if they are not known, or if there are no others.
     """
 
     spec: ArraySpec
@@ -317,6 +319,7 @@ class Evidence:
     noise_rms: float = 0.0
     is_presumed: bool = True
     background: Float32Array | None = None
+    beginning: Evidence | None = None
 
 
 @dataclass(frozen=True, slots=True)

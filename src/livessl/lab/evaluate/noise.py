@@ -75,7 +75,8 @@ SCHEMA: Final = pa.schema(
         ("outvoted", NAME),
         ("whole", pa.bool_()),
         *((name, pa.float32()) for name in ("confidence", "margin", "standing", "second_array", "crossing_deg")),
-        *((name, pa.float32()) for name in ("share", "background")),
+        *((name, pa.float32()) for name in ("share", "background", "beginning", "spread_m")),
+        ("of_lines", pa.bool_()),
     ]
 )
 """One row per sound, noise, level and method, as in the other scenarios. `to_noise_m` is the distance of the position
@@ -301,7 +302,9 @@ class NoisePosition:
         return self._estimators[room.name]
 
 
-_FEATURES: Final = ("whole", "second_array", "crossing_deg", "share", "background")
+_FEATURES: Final = (
+    "whole", "second_array", "crossing_deg", "share", "background", "beginning", "spread_m", "of_lines",
+)  # fmt: skip
 """Features of the confidence that the other scenarios do not store."""
 
 

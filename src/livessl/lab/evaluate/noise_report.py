@@ -15,7 +15,7 @@ from livessl.lab.evaluate.figures.reliability import draw_reliability
 from livessl.lab.evaluate.localizer_report import EDGES, Columns, SummaryRow, read_columns
 from livessl.lab.evaluate.markdown import Block, Heading, Picture, Table, as_markdown
 from livessl.lab.evaluate.noise import LEAD_S, OTHER_NOISE, SENSOR_DB, TALKERS
-from livessl.lab.evaluate.noise_fit import background_fit
+from livessl.lab.evaluate.noise_fit import noise_fit
 from livessl.lab.evaluate.noise_rooms import NOISE_ROOMS
 from livessl.lab.evaluate.noise_sounds import OTHER_SOUNDS
 from livessl.lab.evaluate.noise_summary import (
@@ -102,14 +102,17 @@ def _confidence(columns: Columns) -> list[Block]:
     for name, found in reliability(columns).items():
         cells = {each["low"]: f"{each['confidence']:.2f}: {each['near']:.2f} of {each['sounds']:g}" for each in found}
         rows.append([name, *(cells.get(low, "") for low in EDGES[:-1])])
+    fit = noise_fit(columns)
     return [
         Heading(2, "Confidence"),
         "The confidence of all sounds, located or not. For each class of confidence: its mean, the share of sounds "
         f"within {NEAR_M:g} m, and the number of sounds.",
         Table(("noise", *classes), rows),
-        "A background that explains the whole power at a position costs log-odds of "
-        f"{background_fit(columns):.1f} by the maximum likelihood of these sounds (the constant in use comes from the "
-        f"{HALVES[0]} half).",
+        "By the maximum likelihood of these sounds a beginning that has nothing at the position costs log-odds of "
+        f"{fit.beginning:.1f}, and a second array {fit.weak:.2f} for each unit of peak-to-RMS ratio that it falls "
+        "short of a clear peak. The standard deviation along the least certain axis counts "
+        f"{fit.lines_spread:.1f} times where all arrays are lines. Another source begins "
+        f"{100.0 * fit.elsewhere:.0f} % of the sounds. The constants in use come from the {HALVES[0]} half.",
         Picture("reliability", "Share of sounds within 0.5 m, with its 95 % interval, against the mean confidence"),
     ]
 

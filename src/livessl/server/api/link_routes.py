@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import logging
-from typing import Annotated, Final
+from typing import Final
 
 from fastapi import APIRouter, HTTPException, Request, Response
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, ConfigDict, Field
 
 from livessl.clock import utc_text
 from livessl.schema.answers import errors
@@ -14,8 +14,11 @@ from livessl.schema.values import UtcTime, Version
 from livessl.server.api.auth import Access
 from livessl.server.api.encode import API_VERSION
 from livessl.server.api.routes import as_json
-from livessl.server.signed_links import is_linkable
+from livessl.server.signed_links import LINKABLE, LIVE_PATH
 from livessl.site.alert_models import LIFETIME_S, LinkLifetimeS
+
+LIVE_LIFETIME_S: Final = 600.0
+"""Longest lifetime, in seconds, of a link to the map: who loses access does not go on watching by an old link."""
 
 _NO_TOKENS: Final = "The server uses no tokens, so that no address needs a signature."
 _log = logging.getLogger(__name__)
@@ -26,18 +29,17 @@ class LinkRequest(BaseModel):
 
     model_config = ConfigDict(extra="forbid", strict=True)
 
-    path: Annotated[str, Field(max_length=1000)] = Field(
+    path: str = Field(
+        max_length=1000,
+        pattern=f"^{LINKABLE}$",
         description="Path of a picture of an alert, a recording of an event, or the power map; nothing else.",
         examples=["/api/v1/events/lab-1/clips/best"],
     )
-    lifetime_s: LinkLifetimeS = Field(default=LIFETIME_S, description="Seconds after which the link expires.")
-
-    @field_validator("path")
-    @classmethod
-    def _linkable(cls, path: str) -> str:
-        if not is_linkable(path):
-            raise ValueError("expected the path of a picture, a recording or the map, as the API has it")
-        return path
+    lifetime_s: LinkLifetimeS = Field(
+        default=LIFETIME_S,
+        description="Seconds after which the link expires. A link to the map, which shows what happens now, expires "
+        "after 600 at the latest.",
+    )
 
 
 class Link(BaseModel):
@@ -60,9 +62,10 @@ def link_routes(access: Access) -> APIRouter:
         """Sign a link that opens one picture, recording or map without a token until it expires; for operators."""
         if access.links is None:
             raise HTTPException(409, "this server uses no tokens: the address works without a signature")
-        link, expires_ns = access.links.sign(wanted.path, wanted.lifetime_s)
+        lifetime_s = min(wanted.lifetime_s, LIVE_LIFETIME_S) if wanted.path == LIVE_PATH else wanted.lifetime_s
+        link, expires_ns = access.links.sign(wanted.path, lifetime_s)
         until_utc = utc_text(expires_ns)
-        _log.info("%r has signed a link to %s until %s", request.scope["client_name"], wanted.path, until_utc)
+        _log.info("%r has signed a link to %r until %s", request.scope["client_name"], wanted.path, until_utc)
         return as_json({"v": API_VERSION, "link": link, "until_utc": until_utc})
 
     return router

@@ -154,14 +154,23 @@ async def ended(*tasks: asyncio.Task[Any]) -> None:
     """End tasks, and return when they have ended, whatever they say to it.
 
     A task is cancelled again as long as it goes on: Python 3.11 loses a cancellation that comes at the moment at which
-    what `wait_for` waits for is there, as the next message is all the time under load.
+    what `wait_for` waits for is there, as the next message is all the time under load. If the caller is cancelled
+    meanwhile, by the same rule more than once, that is raised once all have ended.
     """
-    left = set(tasks)
+    left, cancelled = set(tasks), None
     while left:
         for task in left:
             task.cancel()
-        _, left = await asyncio.wait(left, timeout=CANCEL_S)
-    await asyncio.gather(*tasks, return_exceptions=True)  # takes note of their errors
+        try:
+            await asyncio.wait(left, timeout=CANCEL_S)
+        except asyncio.CancelledError as error:
+            cancelled = error
+        left = {task for task in left if not task.done()}
+    for task in tasks:
+        if not task.cancelled():
+            task.exception()  # takes note of it
+    if cancelled is not None:
+        raise cancelled
 
 
 def _insist_on_tls(client: Any, nats: Any) -> None:

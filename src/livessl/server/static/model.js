@@ -130,9 +130,10 @@ export class Model {
     this.highlight = event === null ? null : { ...marker(event, 0), label };
   }
 
-  /** Mark on the plans where an event was found when it was located again, while the event is highlighted; null for nowhere. */
+  /** While an event is highlighted, mark also where it was when it was located again; null for nowhere. */
   setAgain(id, answer) {
-    this.again = answer === null ? null : { ...marker({ ...answer, id }, 0), label: `again: ${answer.method}` };
+    const label = `again: ${answer?.method}`;
+    this.again = answer === null ? null : { ...marker({ ...answer, id }, 0), label, labelBelow: true };
   }
 
   /** Remove what has not been updated for too long. */

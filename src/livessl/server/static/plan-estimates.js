@@ -27,7 +27,7 @@ export function drawEstimate(plan, estimate, scene, highlighted) {
 
 function drawMarker(plan, estimate, colour, old) {
   const { g } = plan;
-  const { position, covariance, kind, label } = estimate;
+  const { position, covariance, kind, label, labelBelow } = estimate;
   const [x, y] = plan.at(position);
   drawEllipse(plan, x, y, ellipse95(covariance, plan.axes), colour, old);
   if (estimate === plan.called) drawCallout(plan, position, x, y, colour);
@@ -48,7 +48,7 @@ function drawMarker(plan, estimate, colour, old) {
   g.textAlign = "left";
   g.textBaseline = "bottom";
   const { width } = g.measureText(label);
-  plan.text(label, x + 14 + width > plan.right ? x - 14 - width : x + 14, y - 8, colour);
+  plan.text(label, x + 14 + width > plan.right ? x - 14 - width : x + 14, labelBelow ? y + 24 : y - 8, colour);
 }
 
 function drawEllipse(plan, x, y, ellipse, colour, old) {

@@ -4,7 +4,7 @@ import { postLong } from "./access.js";
 import { el, write } from "./dom.js";
 import { number, percent, position } from "./format.js";
 
-/** The choices of poses, and the first one's value is sent unless another one is chosen. */
+/** The choices of poses, by the values of the request; the first one is chosen at the start. */
 const SET_UPS = { then: "as set up then", now: "as set up now" };
 
 export class Relocate {
@@ -77,7 +77,7 @@ function table({ stored, again }) {
     ["reason", ({ reason }) => reason ?? ""],
     ["position", ({ position_m: place }) => (place ? position(place) : "–")],
     ["error (1 σ)", ({ std_m: std }) => (std === null ? "–" : `± ${number(std)} m`)],
-    ["confidence", ({ confidence }) => percent(confidence)],
+    ["confidence", ({ confidence, method }) => `${percent(confidence)}${method === "onset" ? "" : " (no probability)"}`],
     ["used", ({ arrays }) => arrays.join(", ") || "–"],
   ];
   const shown = rows.filter(([, text]) => text(stored) || text(again));
