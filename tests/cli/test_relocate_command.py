@@ -8,7 +8,9 @@ from pathlib import Path
 import pytest
 
 from cli.command_runs import Run
-from small_site import write_site
+from livessl.server.clips.relocate_many import Task, relocate_one
+from livessl.site.load import load_site
+from small_site import Changes, write_site
 from stored_clips import CLIPS, clipped, events, messages
 
 
@@ -64,6 +66,54 @@ def test_second_run_goes_on_where_the_first_was_killed(run: Run, site: Path, tmp
     assert "has answers of --method srp-phat --set-up then; name another file" in other.err
     out.write_text("{}\n")
     assert "expected answers of `livessl relocate`" in run(*common).err
+
+
+def test_failed_event_is_tried_again(run: Run, tmp_path: Path) -> None:
+    clipped(tmp_path, messages())
+    site, out = write_site(tmp_path, {"server.clips": CLIPS}), tmp_path / "answers.jsonl"
+    first, second = (event.id for event in events())
+    recording = tmp_path / "clips" / first / "array-north.flac"
+    whole = recording.read_bytes()
+    common = ("relocate", "--site", site, "--out", out, "--jobs", "1", "--json")
+    recording.unlink()
+    for tried in ([first, second], [first]):  # still in vain
+        done = run(*common)
+        assert (done.code, [found["event_id"] for found in done.objects]) == (1, tried)
+    recording.write_bytes(whole)
+    done = run(*common)
+    assert (done.code, [found["event_id"] for found in done.objects]) == (0, [first])
+    held = [json.loads(line) for line in out.read_text().splitlines()]
+    assert [(found["event_id"], found["error"]) for found in held] == [(second, None), (first, None)]
+    assert run(*common).out == ""
+
+
+@pytest.mark.parametrize(
+    ("changes", "options"),
+    [
+        ({"arrays.south.position_m": [2.25, 3.8, 1.5]}, ()),
+        ({"temperature_c": 31.0}, ()),
+        ({"band_hz": [200.0, 4000.0]}, ()),
+        ({"fusion.max_event_s": 7.0}, ()),
+        ({"grid.spacing_m": 0.3}, ()),
+        ({}, ("--joint", "both=north,south")),
+    ],
+)
+def test_answers_of_another_calibration_are_refused(
+    run: Run, tmp_path: Path, changes: Changes, options: tuple[str, ...]
+) -> None:
+    """Nothing is located: the file has the answer of one event, and the folder has no other."""
+    (tmp_path / "clips").mkdir()
+    out, server = tmp_path / "answers.jsonl", {"server.clips": CLIPS}
+    site = load_site(write_site(tmp_path, server))
+    held = relocate_one(Task(site, tmp_path / "clips", None, "now"), "gone-1")
+    out.write_text(json.dumps(held) + "\n")
+    command = ("relocate", "--set-up", "now", "--out", out, "--site")
+    assert run(*command, tmp_path / "site.yaml").code == 0
+    before = out.read_bytes()
+    done = run(*command, write_site(tmp_path, {**server, **changes}), *options)
+    assert done.code == 2
+    assert "has answers of another calibration, --joint, site file or release" in done.err
+    assert out.read_bytes() == before
 
 
 def test_what_cannot_be_located_again_is_told(run: Run, tmp_path: Path) -> None:

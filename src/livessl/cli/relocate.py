@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from statistics import median
@@ -19,6 +19,7 @@ from livessl.errors import UseError
 
 if TYPE_CHECKING:
     from livessl.server.clips.folder import ClipReader
+    from livessl.server.clips.relocate_many import Task
     from livessl.site.models import Site
 
 
@@ -42,7 +43,7 @@ def add_arguments(parser: Any) -> None:
         "--out",
         type=Path,
         metavar="FILE",
-        help="append the answers to FILE, one JSON object a line, and leave out the events that it has already",
+        help="append the answers to FILE, one JSON object a line, and leave out the events that it has located already",
     )
     add("--jobs", type=argument.positive, default=len(os.sched_getaffinity(0)), help="processes (default: all cores)")
     add_json(parser)
@@ -63,7 +64,7 @@ def run(arguments: argparse.Namespace) -> int:
     distances_m: list[float] = []
     failed = 0
     with (
-        _answers(arguments.out, task.method, task.set_up) as (known, keep),
+        _answers(arguments.out, task, wanted) as (known, keep),
         progress.counted("locating", "event") as bar,
     ):
         missing = [name for name in wanted if name not in known]
@@ -93,46 +94,73 @@ def _is_in_span(folder: ClipReader, event_id: str, arguments: argparse.Namespace
     about = folder.about(event_id)
     if about is None:
         return False
-    is_after = arguments.since is None or about["start_ns"] >= arguments.since
-    return is_after and (arguments.until is None or about["start_ns"] <= arguments.until)
+    start_ns = about.get("start_ns")
+    if not isinstance(start_ns, int):  # damaged: it is reported as an event that cannot be located again
+        return True
+    is_after = arguments.since is None or start_ns >= arguments.since
+    return is_after and (arguments.until is None or start_ns <= arguments.until)
 
 
 @contextmanager
-def _answers(path: Path | None, method: str | None, set_up: str) -> Iterator[tuple[set[str], Any]]:
-    """Open the file of answers; yield the ids of the events that it has, and a function that appends an answer.
+def _answers(path: Path | None, task: Task, wanted: Sequence[str]) -> Iterator[tuple[set[str], Any]]:
+    """Open the file of answers; yield the ids of the events that were located, and a function that appends an answer.
+
+    What the file says of wanted events that could not be located is removed, because they are tried again.
 
     Raises
     ------
     UseError
-        If it has answers of another method or set-up, or something else.
+        If it has answers of another method, set-up or calibration, or something else.
     """
     if path is None:
         yield set(), lambda _: None
         return
-    known = set()
-    whole = 0
+    known: set[str] = set()
+    kept: list[bytes] = []
     if path.exists():
-        lines = path.read_bytes().splitlines(keepends=True)
-        for line in lines:
+        again = set(wanted)
+        for line in path.read_bytes().splitlines(keepends=True):
             if not line.endswith(b"\n"):  # a command that was killed has left it; it is written again
                 break
-            try:
-                found = json.loads(line)
-                known.add(str(found["event_id"]))
-                held = found["method"], found["set_up"]
-            except (ValueError, KeyError, TypeError) as error:
-                raise UseError(f"--out: expected answers of `livessl relocate` in {path}, got another file") from error
-            if held != (method, set_up):
-                raise UseError(f"--out: {path} has answers of --method {held[0]} --set-up {held[1]}; name another file")
-            whole += len(line)
+            event_id, is_located = _held(path, line, task)
+            if is_located:
+                known.add(event_id)
+            if is_located or event_id not in again:
+                kept.append(line)
+        fresh = path.with_name(f"{path.name}.partial")
+        fresh.write_bytes(b"".join(kept))
+        fresh.replace(path)
     with path.open("ab") as file:
-        file.truncate(whole)
 
         def keep(found: dict[str, Any]) -> None:
             file.write(json.dumps(found).encode() + b"\n")
             file.flush()
 
         yield known, keep
+
+
+def _held(path: Path, line: bytes, task: Task) -> tuple[str, bool]:
+    """Return the id of the event that a line of the file of answers is about, and whether it was located.
+
+    Raises
+    ------
+    UseError
+        If the line is no answer, or one of another task.
+    """
+    try:
+        found = json.loads(line)
+        event_id, method, set_up, digest = (found[name] for name in ("event_id", "method", "set_up", "digest"))
+        is_located = found["again"] is not None
+    except (ValueError, KeyError, TypeError) as error:
+        raise UseError(f"--out: expected answers of `livessl relocate` in {path}, got another file") from error
+    if (method, set_up) != (task.method, task.set_up):
+        raise UseError(f"--out: {path} has answers of --method {method} --set-up {set_up}; name another file")
+    if digest != task.digest:
+        raise UseError(
+            f"--out: {path} has answers of another calibration, --joint, site file or release, which do not belong "
+            "beside those of now; name another file"
+        )
+    return str(event_id), is_located
 
 
 def _print(found: dict[str, Any], *, as_json: bool) -> None:

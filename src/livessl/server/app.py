@@ -22,6 +22,7 @@ from livessl.server.api.auth import Access
 from livessl.server.api.encode import JsonObject
 from livessl.server.array_states import ArrayStates
 from livessl.server.clips.listeners import Listeners
+from livessl.server.clips.relocate import Relocator
 from livessl.server.clips.service import Clips
 from livessl.server.compiling import KernelLoader
 from livessl.server.engine import Engine
@@ -150,6 +151,7 @@ def assemble(
         set_up = SetUpInForce(site, clock, publish)
         kept, listeners = site.server.clips, Listeners()
         clips = None if kept is None else Clips(site, kept, clock, site_time, overload)
+        relocator = None if clips is None else Relocator(clips.folder, clock, lambda: set_up.site, overload)
         evidence = Evidence(lambda: set_up.site, zones, clips)
         around = Surroundings(clock, store, zones, url, evidence, traces, links)
         alerts = Alerts(site, around, Conditions(array_states, set_up_watch, site_time), publish_alert)
@@ -188,6 +190,7 @@ def assemble(
         event_log=event_log,
         alerts=alerts,
         clips=clips,
+        relocator=relocator,
         listeners=listeners,
         tracks=tracks,
         maps=maps,
@@ -296,6 +299,7 @@ class Server:
                 asyncio.run(self._serve())
         finally:
             sys.setswitchinterval(before_s)
+            self._end_relocation()
             self._kernel_loader.stop()
             self.parts.reloader.stop()
             self.parts.engine.stop()
@@ -369,6 +373,12 @@ class Server:
             await asyncio.sleep(WATCH_S)
         self.stop()
         self.parts.fanout.ended.set()
+        self._end_relocation()
+
+    def _end_relocation(self) -> None:
+        """End the request that waits for an event to be located again; a thread that waited on would hold the exit."""
+        if self.parts.relocator is not None:
+            self.parts.relocator.stop()
 
     def _publish(self, message: JsonObject) -> None:
         """Hand a message to subscribers; on the fusion thread."""

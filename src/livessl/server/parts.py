@@ -8,6 +8,7 @@ from livessl.clock import Clock
 from livessl.server.alerts.service import Alerts
 from livessl.server.array_states import ArrayStates
 from livessl.server.clips.listeners import Listeners
+from livessl.server.clips.relocate import Relocator
 from livessl.server.clips.service import Clips
 from livessl.server.engine import Engine
 from livessl.server.event_log import EventLog
@@ -52,6 +53,7 @@ class Parts:
     event_log: EventLog
     alerts: Alerts
     clips: Clips | None
+    relocator: Relocator | None
     listeners: Listeners
     tracks: Tracks
     maps: Maps

@@ -6,6 +6,7 @@ import json
 import shutil
 import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,8 +15,10 @@ import numpy as np
 import pytest
 
 from livessl.core.stream.load_policy import LoadPolicy
+from livessl.core.types import Frame
 from livessl.server.app import Server
 from livessl.server.clips import relocate as relocation
+from livessl.server.clips.stored_sound import stored_frames
 from livessl.server.overload import Overload
 from livessl.site.tokens import add_token
 from messages import event_message
@@ -138,6 +141,74 @@ def test_live_sound_comes_first(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(Overload, "message", "behind")
     refusal = desk.refusal(503, desk.events()[0]["id"])
     assert "the server is overloaded, and live sound comes first; try again when it is not" in refusal
+
+
+def blocking_frames(monkeypatch: pytest.MonkeyPatch) -> tuple[threading.Event, threading.Event]:
+    """Make a relocation wait once it has read its first array; return events for that and for going on."""
+    begun, may_go_on = threading.Event(), threading.Event()
+
+    def slow(*wanted: Any) -> list[Frame]:
+        begun.set()
+        assert may_go_on.wait(HANG_S)
+        return stored_frames(*wanted)
+
+    monkeypatch.setattr(relocation, "stored_frames", slow)
+    return begun, may_go_on
+
+
+def test_relocation_gives_way_when_an_overload_begins(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    event = desk.events()[0]["id"]
+    begun, may_go_on = blocking_frames(monkeypatch)
+    fusions: list[Any] = []
+    with monkeypatch.context() as patch, ThreadPoolExecutor(1) as pool:
+        patch.setattr(relocation, "events_of", lambda *wanted, **_: fusions.append(wanted))
+        refused = pool.submit(desk.refusal, 503, event)
+        assert begun.wait(HANG_S)
+        patch.setattr(Overload, "message", "behind")
+        may_go_on.set()
+        assert "the server is overloaded, and live sound comes first" in refused.result(HANG_S)
+    assert fusions == []
+    assert desk.relocate(event)["event_id"] == event
+
+
+def test_relocation_in_flight_does_not_delay_the_end(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """The request is answered and the server ends while the computation still hangs in one of its steps."""
+    event = desk.events()[0]
+    shutil.copytree(desk.folder / event["id"], tmp_path / "clips" / event["id"])
+    begun, may_go_on = blocking_frames(monkeypatch)
+    with ThreadPoolExecutor(1) as pool:
+        with running_server(site_of({"server.clips": CLIPS["server.clips"]}, tmp_path)) as server:
+            server.parts.store.add(event_message(id=event["id"]), 1)
+            url = f"{server.url}/api/v1/events/{event['id']}/relocate"
+            waiting = pool.submit(httpx.post, url, json={"method": "onset"}, timeout=HANG_S)
+            assert begun.wait(HANG_S)
+        answer = waiting.result(HANG_S)
+    assert (answer.status_code, "the server is stopping" in answer.text) == (503, True)
+    hanging = [thread for thread in threading.enumerate() if thread.name == "relocate"]
+    assert len(hanging) == 1
+    may_go_on.set()
+    hanging[0].join(HANG_S)
+    assert not hanging[0].is_alive()
+
+
+def test_sound_that_would_use_up_the_memory_is_refused(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(relocation, "MOST_BYTES", 1000)
+    refusal = desk.refusal(409, desk.events()[0]["id"])
+    assert "too large for a running server" in refusal
+    assert "locate the event with `livessl relocate`" in refusal
+
+
+def test_damaged_clip_is_refused(desk: Desk) -> None:
+    event = desk.events()[0]["id"]
+    path = desk.folder / event / "clip.json"
+    whole = path.read_bytes()
+    about = json.loads(whole)
+    about["arrays"]["north"]["uncertainty"]["humidity_percent"] = 5.0
+    path.write_text(json.dumps(about))
+    assert "expected a clip.json that this release can read" in desk.refusal(409, event)
+    path.write_bytes(whole)  # for the other tests
 
 
 def test_recordings_that_are_made_or_gone_are_told_apart(

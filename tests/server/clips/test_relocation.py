@@ -2,18 +2,32 @@
 
 from __future__ import annotations
 
+import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import orjson
 import pytest
+import soundfile
 
-from livessl.core.types import Event, FloatArray, Frame, Status
+from livessl.core.types import FRAME_NS, Event, FloatArray, Frame, Status
 from livessl.recordings.assign import AssignedRecording
 from livessl.recordings.recording import MemoryRecording
-from livessl.server.clips.relocate import NoClipError, RelocationError, relocate
+from livessl.server.clips import relocate as relocation
+from livessl.server.clips.folder import ClipReader
+from livessl.server.clips.relocate import relocate
+from livessl.server.clips.relocate_many import Task, relocate_many
 from livessl.server.clips.service import Clips
+from livessl.server.clips.stored_sound import (
+    NoClipError,
+    RelocationError,
+    check_memory,
+    stored_frames,
+    stored_sound,
+)
 from livessl.simulation.scene import make_scene, render
 from livessl.site.models import Site
 from small_site import RATE_HZ, hiss, scene, site_of
@@ -21,8 +35,20 @@ from stored_clips import START_NS, Offsets, clipped, events, located, messages, 
 
 
 @pytest.fixture(scope="module")
-def clips(tmp_path_factory: pytest.TempPathFactory) -> Clips:
-    return clipped(tmp_path_factory.mktemp("site"), messages())
+def directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("site")
+
+
+@pytest.fixture(scope="module")
+def clips(directory: Path) -> Clips:
+    return clipped(directory, messages())
+
+
+@pytest.fixture
+def copied(clips: Clips, directory: Path, tmp_path: Path) -> Path:
+    """A copy of the folder of clips."""
+    assert clips.folder.count
+    return Path(shutil.copytree(directory / "clips", tmp_path / "clips"))
 
 
 def place_m(event: Event) -> FloatArray:
@@ -151,3 +177,80 @@ def test_clip_that_does_not_fit_says_why(tmp_path: Path) -> None:
     path.write_bytes(orjson.dumps({name: value for name, value in about.items() if name != "arrays"}))
     with pytest.raises(RelocationError, match=r"are of an earlier release, .*; locate them with `livessl locate --wav"):
         relocate(site, folder, second, "onset", "then")
+
+
+INDEX = START_NS // FRAME_NS
+
+DAMAGES: dict[str, tuple[str, Any, str]] = {
+    "field of another release": ("arrays.north.uncertainty.humidity_percent", 3.0, "humidity_percent"),
+    "no speed of sound": ("c_m_s", ..., "'c_m_s' is missing"),
+    "speed of sound of zero": ("c_m_s", 0, "c_m_s: expected a number above 0, got 0"),
+    "no list of files": ("files", ..., "'files' is missing"),
+    "files of another form": ("files", ["a.flac"], "string indices|indices must be"),
+    "no file of an array": ("files", [], "'north' is missing"),
+    "short row": ("arrays.south.frames", [[1, 2, 3]], r"not enough values"),
+    "begin before the recording": ("arrays.south.frames", [[1, -2, 3, 0.1, True, False]], "a begin of 0 or more"),
+    "frame beyond the recording": (
+        "arrays.south.frames",
+        [[INDEX, 10**9, 3, 0.1, True, False]],
+        "expected 1000000003 samp",
+    ),
+    "frame of another year": ("arrays.south.frames", [[1, 0, 3, 0.1, True, False]], "within 3600 s of the event"),
+    "flat positions": (
+        "arrays.south.microphones_m",
+        [[1.0, 2.0]] * 4,
+        r"south\.microphones_m: expected positions \(K, 3\)",
+    ),
+    "positions without numbers": ("arrays.south.microphones_m", [[1.0, 2.0, None]] * 4, "expected positions"),
+    "arrays of another form": ("arrays", ["north"], "has no attribute 'items'"),
+    "no answer": ("answer", ..., "'answer' is missing"),
+    "answer of another form": ("answer.position_m", [1.0], "not enough values"),
+}
+
+
+def put(about: dict[str, Any], key: str, value: Any) -> dict[str, Any]:
+    """A copy with another value of a dotted key, or without it."""
+    first, _, rest = key.partition(".")
+    if rest:
+        return {**about, first: put(about[first], rest, value)}
+    return {name: each for name, each in {**about, first: value}.items() if each is not ...}
+
+
+@pytest.mark.parametrize(("key", "value", "why"), DAMAGES.values(), ids=DAMAGES)
+def test_damaged_or_future_clip_is_refused_alone(copied: Path, key: str, value: Any, why: str) -> None:
+    first, second = (event.id for event in events())
+    path = copied / first / "clip.json"
+    path.write_bytes(orjson.dumps(put(orjson.loads(path.read_bytes()), key, value)))
+    with pytest.raises(RelocationError, match=f"{first}.*({why}).*; .*delete (it|them)"):
+        relocate(site_of(), ClipReader(copied), first, "onset", "then")
+    task = Task(site_of(), copied, None, "then")
+    damaged, whole = relocate_many(task, [first, second], 1)
+    assert (damaged["again"], whole["error"], whole["again"]["status"]) == (None, None, "located")
+    assert re.search(why, damaged["error"])
+
+
+def test_sound_that_takes_too_much_memory_is_refused_before_it_is_read(
+    copied: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, event = ClipReader(copied), events()[0].id
+    frames = [frame for array in stored_sound(folder, event).arrays for frame in stored_frames(folder, event, array)]
+    nbytes = sum(frame.samples.nbytes for frame in frames)
+    about = folder.about(event)
+    assert about is not None
+    whole = sum(4 * each["channels"] * round(each["sample_rate_hz"] * each["duration_s"]) for each in about["files"])
+    assert 0.5 * whole < nbytes <= whole
+    check_memory(stored_sound(folder, event), whole)
+    read: list[Any] = []
+    monkeypatch.setattr(relocation, "stored_frames", lambda *wanted: read.append(wanted))
+    with pytest.raises(
+        RelocationError, match=r"expected at most \d+ MB of decoded samples, got \d+ MB; locate the event"
+    ):
+        relocate(site_of(), folder, event, "onset", "then", most_bytes=nbytes - 1)
+    assert read == []
+
+
+def test_recording_of_other_channels_is_refused(copied: Path) -> None:
+    event = events()[0].id
+    soundfile.write(copied / event / "array-south.flac", np.zeros((RATE_HZ, 3)), RATE_HZ)
+    with pytest.raises(RelocationError, match=r"expected 4 channels, as clip\.json says, got 3; delete it"):
+        relocate(site_of(), ClipReader(copied), event, "onset", "then")

@@ -17,8 +17,9 @@ from livessl.schema.answers import errors
 from livessl.server.api import clip_schema
 from livessl.server.api.encode import API_VERSION
 from livessl.server.api.routes import as_json
-from livessl.server.clips.relocate import is_relocatable, known_methods
+from livessl.server.clips.relocate import known_methods
 from livessl.server.clips.service import Clips, state_of
+from livessl.server.clips.stored_sound import is_relocatable
 from livessl.server.parts import Parts
 
 MEDIA_TYPES: Final = {".flac": "audio/flac", ".wav": "audio/wav"}

@@ -13,30 +13,21 @@ from livessl.schema.answers import errors
 from livessl.server.api.encode import API_VERSION, JsonObject, answer, std_m
 from livessl.server.api.queries import unprocessable
 from livessl.server.api.routes import as_json
-from livessl.server.clips.relocate import (
-    BusyError,
-    NoClipError,
-    RelocationError,
-    Relocator,
-    distance_m,
-    known_methods,
-)
+from livessl.server.clips.relocate import BusyError, distance_m, known_methods
+from livessl.server.clips.stored_sound import NoClipError, RelocationError
 from livessl.server.parts import Parts
 
 _TEXTS: Final = {
     404: "There is no event of that id, or it has no recordings.",
-    409: "Its recordings are still being made, or are of an earlier release; an array has changed or gone.",
-    503: "Another event is being located again, the server is overloaded, or the event database cannot be used.",
+    409: "Its recordings are still being made, damaged, too large or of another release; an array has changed or gone.",
+    503: "Another event is being located again, the server is overloaded or stopping, or the database cannot be used.",
 }
 _log = logging.getLogger(__name__)
 
 
 def relocate_route(parts: Parts) -> APIRouter:
     """Both answers beside each other."""
-    clips, router = parts.clips, APIRouter(prefix="/api/v1", tags=["clips"])
-    relocator = None
-    if clips is not None:
-        relocator = Relocator(clips.folder, parts.clock, lambda: parts.set_up.site, parts.overload)
+    clips, relocator, router = parts.clips, parts.relocator, APIRouter(prefix="/api/v1", tags=["clips"])
 
     @router.post(
         "/events/{event_id}/relocate",

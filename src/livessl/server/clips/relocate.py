@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any, Final, Literal
+from typing import Final, Literal
 
 import numpy as np
-import soundfile
 
 from livessl.clock import Clock
 from livessl.core.methods import METHODS
@@ -26,10 +25,16 @@ from livessl.core.types import (
     Frame,
     Output,
     Status,
-    Uncertainty,
 )
-from livessl.errors import RunError
-from livessl.server.clips.folder import About, ClipReader
+from livessl.server.clips.folder import ClipReader
+from livessl.server.clips.stored_sound import (
+    MOST_BYTES,
+    RelocationError,
+    StoredSound,
+    check_memory,
+    stored_frames,
+    stored_sound,
+)
 from livessl.server.overload import Overload
 from livessl.site.models import Site
 
@@ -42,16 +47,11 @@ STRIDE: Final = 40
 SAME_M: Final = 1e-4
 """Distance, in metres, up to which a microphone counts as being at the same place: positions are stored so exactly."""
 
+GiveWay = Callable[[], None]
+"""Is called between two steps of a long computation; raises `BusyError` to end it."""
+
 SetUp = Literal["then", "now"]
 """The poses of the arrays, and the speed of sound: those by which the event was located, or those now in force."""
-
-
-class RelocationError(RunError):
-    """An event cannot be located again, for a reason that its text gives."""
-
-
-class NoClipError(RelocationError):
-    """The event has no recordings."""
 
 
 class BusyError(RelocationError):
@@ -77,6 +77,10 @@ class Relocation:
     moved: tuple[str, ...]
 
 
+def _go_on() -> None:
+    """Never end a computation."""
+
+
 def known_methods(site: Site) -> tuple[str, ...]:
     """Return the methods by which an event may be located again: those that are registered, and the site's own.
 
@@ -85,12 +89,15 @@ def known_methods(site: Site) -> tuple[str, ...]:
     return tuple(dict.fromkeys((*METHODS, site.fusion.method)))
 
 
-def is_relocatable(about: Mapping[str, Any]) -> bool:
-    """Return whether a clip says of its frames what locating again needs."""
-    return bool(about.get("arrays"))
-
-
-def relocate(site: Site, folder: ClipReader, event_id: str, method: str, set_up: SetUp) -> Relocation:
+def relocate(
+    site: Site,
+    folder: ClipReader,
+    event_id: str,
+    method: str,
+    set_up: SetUp,
+    give_way: GiveWay = _go_on,
+    most_bytes: int | None = None,
+) -> Relocation:
     """Locate an event again from its clip.
 
     Parameters
@@ -102,29 +109,32 @@ def relocate(site: Site, folder: ClipReader, event_id: str, method: str, set_up:
     method : str
         One of `known_methods`.
     set_up : "then" or "now"
+    give_way : callable
+        Is called before each array is read and before each step of the fusion; ends it by an error.
+    most_bytes : int or None
+        Most bytes of decoded samples; None for no limit.
 
     Raises
     ------
     NoClipError
         If the event has no recordings.
     RelocationError
-        If the clip does not fit: an earlier release has made it, an array is no longer there, a file cannot be read, or
-        no sound of the event is in it.
+        If the clip does not fit: another release has made it, it is damaged, an array is no longer there, a file cannot
+        be read, it takes more than `most_bytes`, or no sound of the event is in it.
     """
-    about = folder.about(event_id)
-    if about is None:
-        raise NoClipError(f"event {event_id!r} has no recordings; it cannot be located again without its sound")
-    if not is_relocatable(about):
-        raise RelocationError(
-            f"the recordings of {event_id!r} are of an earlier release, which did not store where frames begin; "
-            "locate them with `livessl locate --wav ARRAY=FILE`"
-        )
-    specs = _specs(site, about)
+    sound = stored_sound(folder, event_id)
+    if most_bytes is not None:
+        check_memory(sound, most_bytes)
+    specs = _specs(site, sound)
     moved = tuple(name for name, spec in specs.items() if _is_moved(spec, site.array(name)))
     if set_up == "then":
         processed = tuple(specs.get(spec.name, spec) for spec in site.processed)
-        site = site.model_copy(update={"processed": processed, "c_m_s": float(about["c_m_s"])})
-    sources = _sources(site, _frames(folder, event_id, about), method, about)
+        site = site.model_copy(update={"processed": processed, "c_m_s": sound.c_m_s})
+    frames: list[Frame] = []
+    for array in sound.arrays:
+        give_way()
+        frames += stored_frames(folder, event_id, array)
+    sources = _sources(site, frames, method, sound, give_way)
     if not sources:
         raise RelocationError(
             f"the recordings of {event_id!r} have no active frame of it: frames are missing; see its gaps_s"
@@ -133,12 +143,12 @@ def relocate(site: Site, folder: ClipReader, event_id: str, method: str, set_up:
     return Relocation(wanted, tuple(event for event in sources if event is not wanted), moved)
 
 
-def _sources(site: Site, frames: Sequence[Frame], method: str, about: About) -> list[Event]:
+def _sources(site: Site, frames: Sequence[Frame], method: str, sound: StoredSound, give_way: GiveWay) -> list[Event]:
     """Return the events, one for each source, of the sound of a clip; none if it has no active frame of it."""
-    event_id, start_ns = str(about["event_id"]), int(about["start_ns"])
+    event_id, start_ns = sound.event_id, sound.start_ns
     sources = [
         event
-        for event in events_of(site, frames, method)
+        for event in events_of(site, frames, method, give_way=give_way)
         if event_id == event.id or event_id.startswith(f"{event.id}-") or event.id.startswith(f"{event_id}-")
     ]
     if sources:
@@ -146,14 +156,16 @@ def _sources(site: Site, frames: Sequence[Frame], method: str, about: About) -> 
     # a part of a longer sound, which was split: what the clip has of the part before is no event of its own
     start = round(start_ns / FRAME_NS)
     quiet = [replace(frame, active=frame.active and frame.frame_index >= start) for frame in frames]
-    found = events_of(site, quiet, method, reported_until=start)
-    end_ns = start_ns + round(1e9 * about["duration_s"])
+    found = events_of(site, quiet, method, reported_until=start, give_way=give_way)
+    end_ns = start_ns + round(1e9 * sound.duration_s)
     overlaps = {event.start_ns: min(event.end_ns, end_ns) - max(event.start_ns, start_ns) for event in found}
     longest = max(overlaps, key=lambda at_ns: overlaps[at_ns], default=None)
     return [event for event in found if event.start_ns == longest and overlaps[event.start_ns] > 0]
 
 
-def events_of(site: Site, frames: Sequence[Frame], method: str, reported_until: int | None = None) -> list[Event]:
+def events_of(
+    site: Site, frames: Sequence[Frame], method: str, reported_until: int | None = None, give_way: GiveWay = _go_on
+) -> list[Event]:
     """Locate the events in frames of a site's arrays, on joint frame indices, by the fusion that locates live sound.
 
     Requested frames are given only if the fusion requests them. Frames before `reported_until` are in no pre-roll.
@@ -177,11 +189,13 @@ def events_of(site: Site, frames: Sequence[Frame], method: str, reported_until: 
         fusion.set_answers(array, True)
     outputs: list[Output] = []
     while sent:
+        give_way()
         end, end_ns = sent[0].frame_index + STRIDE, (sent[0].frame_index + STRIDE + 1) * FRAME_NS
         taken = [frame for frame in sent if frame.frame_index <= end]
         sent = sent[len(taken) :]
         fresh = fusion.step(taken, end_ns, complete_until=end)
         while requests := [output for output in fresh if isinstance(output, BackfillRequest)]:
+            give_way()
             outputs += fresh
             for request in requests:  # what is not in the clip does not come any more
                 fusion.set_answers(request.array, False)
@@ -193,11 +207,12 @@ def events_of(site: Site, frames: Sequence[Frame], method: str, reported_until: 
                 fusion.set_answers(request.array, True)
         outputs += fresh
         if not sent:
+            give_way()
             outputs += fusion.flush(end_ns)
     return [output for output in outputs if isinstance(output, Event)]
 
 
-def _specs(site: Site, about: About) -> dict[str, ArraySpec]:
+def _specs(site: Site, sound: StoredSound) -> dict[str, ArraySpec]:
     """Return the arrays of a clip as they were then, in the bands of now.
 
     Raises
@@ -207,8 +222,8 @@ def _specs(site: Site, about: About) -> dict[str, ArraySpec]:
     """
     now = {spec.name: spec for spec in site.processed}
     specs = {}
-    for name, known in about["arrays"].items():
-        microphones_m = np.array(known["microphones_m"], dtype=np.float64)
+    for array in sound.arrays:
+        name, microphones_m = array.name, array.microphones_m
         count = len(now[name].microphones_m) if name in now else 0
         if count != len(microphones_m):
             there = f"{count} microphones" if count else "no such array"
@@ -216,48 +231,12 @@ def _specs(site: Site, about: About) -> dict[str, ArraySpec]:
                 f"array {name!r}: its recording has {len(microphones_m)} channels, and the site file has {there} now; "
                 "locate the recordings with the former site file by `livessl locate`"
             )
-        specs[name] = replace(now[name], microphones_m=microphones_m, uncertainty=Uncertainty(**known["uncertainty"]))
+        specs[name] = replace(now[name], microphones_m=microphones_m, uncertainty=array.uncertainty)
     return specs
 
 
 def _is_moved(then: ArraySpec, now: ArraySpec) -> bool:
     return float(np.abs(then.microphones_m - now.microphones_m).max()) > SAME_M
-
-
-def _frames(folder: ClipReader, event_id: str, about: About) -> list[Frame]:
-    """Return all frames of a clip.
-
-    Raises
-    ------
-    NoClipError
-        If a recording has been deleted meanwhile.
-    RelocationError
-        If one cannot be read.
-    """
-    frames: list[Frame] = []
-    for file in about["files"]:
-        if file["kind"] != "array":
-            continue
-        path = folder.file(event_id, file["name"])
-        if path is None:
-            raise NoClipError(f"event {event_id!r}: its recording {file['name']!r} is gone; it cannot be located again")
-        try:
-            samples, _ = soundfile.read(path, dtype="float32", always_2d=True)
-        except (OSError, soundfile.SoundFileError) as error:
-            raise RelocationError(f"event {event_id!r}: {file['name']} cannot be read: {error}; delete it") from error
-        frames += _frames_of(file["array"], about["arrays"][file["array"]], samples.T)
-    return frames
-
-
-def _frames_of(array: str, known: Mapping[str, Any], samples: Any) -> list[Frame]:
-    rate_hz, time_ns = float(known["sample_rate_hz"]), int(known["time_ns"])
-    frames = []
-    for number, (index, begin, length, power, active, requested) in enumerate(known["frames"], 1):
-        piece = np.ascontiguousarray(samples[:, begin : begin + length])
-        at_ns = time_ns + round(1e9 * begin / rate_hz)
-        sequence = 0 if requested else number
-        frames.append(Frame(array, sequence, index, at_ns, rate_hz, piece, power, active, requested))
-    return frames
 
 
 class Relocator:
@@ -270,7 +249,8 @@ class Relocator:
     site : callable
         Returns the site with the poses that are in force.
     overload : Overload
-        Nothing is located again while the server is overloaded.
+        Nothing is located again while the server is overloaded; a computation that runs when an overload begins ends at
+        its next step.
     """
 
     def __init__(self, folder: ClipReader, clock: Clock, site: Callable[[], Site], overload: Overload) -> None:
@@ -279,6 +259,18 @@ class Relocator:
         self._site = site
         self._overload = overload
         self._one_at_a_time = threading.Lock()
+        self._stopping = threading.Event()
+        self._ended: threading.Event | None = None  # of the computation that runs, or ran last
+
+    def stop(self) -> None:
+        """Refuse the request that waits, and all further ones; wait for nothing.
+
+        The computation that runs ends at its next step.
+        """
+        self._stopping.set()
+        ended = self._ended
+        if ended is not None:
+            ended.set()
 
     def relocate(self, event_id: str, method: str, set_up: SetUp) -> tuple[Relocation, float]:
         """Locate an event again, and wait for it, as the function does; return also how long it took, in seconds.
@@ -286,41 +278,52 @@ class Relocator:
         Raises
         ------
         BusyError
-            If another event is being located again, or the server is overloaded.
+            If another event is being located again, the server is stopping, or it is or becomes overloaded.
         NoClipError, RelocationError
             As the function.
         """
-        if self._overload.message is not None:
-            raise BusyError("the server is overloaded, and live sound comes first; try again when it is not")
+        self._give_way()
         if not self._one_at_a_time.acquire(blocking=False):  # a thread that waited would be missing for other requests
             raise BusyError("another event is being located again; try again in some seconds")
         try:
             begun_ns = self._clock.monotonic_ns()
-            made = _at_leisure(lambda: relocate(self._site(), self._folder, event_id, method, set_up))
+            made = self._at_leisure(
+                lambda: relocate(self._site(), self._folder, event_id, method, set_up, self._give_way, MOST_BYTES)
+            )
             return made, (self._clock.monotonic_ns() - begun_ns) / 1e9
         finally:
             self._one_at_a_time.release()
 
+    def _give_way(self) -> None:
+        if self._stopping.is_set():
+            raise BusyError("the server is stopping; try again when it has started again")
+        if self._overload.message is not None:
+            raise BusyError("the server is overloaded, and live sound comes first; try again when it is not")
 
-def _at_leisure(work: Callable[[], Relocation]) -> Relocation:
-    """Do some work on a thread of low priority of its own, and wait for it; raise what it raises."""
-    made: list[Relocation] = []
-    failed: list[BaseException] = []
+    def _at_leisure(self, work: Callable[[], Relocation]) -> Relocation:
+        """Do some work on a thread of low priority of its own, and wait for it or for `stop`; raise what it raises."""
+        made: list[Relocation] = []
+        failed: list[BaseException] = []
+        self._ended = ended = threading.Event()
 
-    def run() -> None:
-        with suppress(OSError):  # a system that does not know priorities of threads
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)
-        try:
-            made.append(work())
-        except BaseException as error:  # noqa: BLE001 - it is raised by the thread that waits
-            failed.append(error)
+        def run() -> None:
+            with suppress(OSError):  # a system that does not know priorities of threads
+                os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)
+            try:
+                made.append(work())
+            except BaseException as error:  # noqa: BLE001 - it is raised by the thread that waits
+                failed.append(error)
+            ended.set()
 
-    thread = threading.Thread(target=run, name="relocate", daemon=True)
-    thread.start()
-    thread.join()
-    if failed:
-        raise failed[0]
-    return made[0]
+        threading.Thread(target=run, name="relocate", daemon=True).start()
+        if not self._stopping.is_set():  # `stop` may have missed the new event
+            ended.wait()
+        if made:
+            return made[0]
+        if failed:
+            raise failed[0]
+        self._give_way()
+        raise AssertionError("a computation has ended without a result")
 
 
 def distance_m(stored_m: Sequence[float] | None, again: Event) -> float | None:

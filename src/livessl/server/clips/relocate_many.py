@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
 import signal
 import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from multiprocessing import active_children, get_context, parent_process
 from pathlib import Path
-from typing import Any
 
 from threadpoolctl import threadpool_limits
 
+from livessl import __version__
+from livessl.core.types import ArraySpec
 from livessl.errors import ConfigError
 from livessl.server.api.encode import JsonObject, answer
-from livessl.server.clips.folder import About, ClipReader
-from livessl.server.clips.relocate import RelocationError, SetUp, distance_m, relocate
+from livessl.server.clips.folder import ClipReader
+from livessl.server.clips.relocate import SetUp, distance_m, relocate
+from livessl.server.clips.stored_sound import RelocationError, stored_sound
 from livessl.site.models import Site
 
 
@@ -41,27 +45,51 @@ class Task:
     method: str | None
     set_up: SetUp
 
+    @property
+    def digest(self) -> str:
+        """Digest of everything but the clips that decides the answers.
+
+        These are the release, the method and the set-up, and of the site the processed arrays (poses, bands, accuracy,
+        joints), the speed of sound, the search grid, the activity detection and the fusion. The code of a method that
+        is named by MODULE:NAME is not part of it.
+        """
+        site = self.site
+        decisive = {
+            "version": __version__,
+            "method": self.method,
+            "set_up": self.set_up,
+            "arrays": [_decisive(spec) for spec in site.processed],
+            "c_m_s": site.c_m_s,
+            "settings": site.model_dump(mode="json", include={"site", "room", "grid", "activity", "fusion"}),
+        }
+        return hashlib.sha256(json.dumps(decisive, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def _decisive(spec: ArraySpec) -> JsonObject:
+    return {**asdict(spec), "microphones_m": spec.microphones_m.round(9).tolist()}
+
 
 def relocate_one(task: Task, event_id: str) -> JsonObject:
     """Locate an event again; return both answers, or the first one and why there is no second."""
     folder = ClipReader(task.folder)
     about = folder.about(event_id) or {}
-    stored: Any = about.get("answer")
     found: JsonObject = {
         "kind": "relocation",
         "event_id": event_id,
         "time_utc": about.get("time_utc"),
         "method": task.method,
         "set_up": task.set_up,
+        "digest": task.digest,
         "moved_arrays": [],
-        "stored": stored,
+        "stored": about.get("answer"),
         "again": None,
         "other_sources": [],
         "distance_m": None,
         "error": None,
     }
     try:
-        again = relocate(task.site, folder, event_id, task.method or _method(about), task.set_up)
+        stored = stored_sound(folder, event_id).answer
+        again = relocate(task.site, folder, event_id, task.method or stored["method"], task.set_up)
     except (RelocationError, ConfigError) as error:
         return found | {"error": str(error)}
     return found | {
@@ -119,8 +147,3 @@ def _begin(task: Task) -> None:
 
 def _relocate_sent(event_id: str) -> JsonObject:
     return relocate_one(_sent[0], event_id)
-
-
-def _method(about: About) -> str:
-    """Return the method by which an event was located; without it the clip is refused anyway."""
-    return str(about["answer"]["method"]) if "answer" in about else ""

@@ -1,0 +1,284 @@
+"""Reads what locating an event again needs from its clip: the set-up at that time, the frames and their samples.
+
+Nothing in `clip.json` is relied on before it is checked: another release may have written it, or a disk damaged it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import soundfile
+
+from livessl.core.types import FRAME_NS, Float32Array, FloatArray, Frame, Uncertainty
+from livessl.errors import RunError
+from livessl.server.clips.folder import ABOUT, ClipReader
+
+MOST_BYTES: Final = 256_000_000
+"""Most bytes of decoded samples that a server holds to locate one event again. A sound of 60 s, the longest event, at
+48 kHz from five arrays of four microphones takes 230 MB; a server whose memory is used up loses live sound."""
+
+MOST_OFF_S: Final = 3600.0
+"""Largest distance, in seconds, between the event and a frame of its clip; the fusion steps through all frame indices
+between, so that one damaged index would never end."""
+
+_UNREADABLE: Final = (AttributeError, KeyError, OverflowError, TypeError, ValueError)
+"""Errors that reading a `clip.json` of another form raises."""
+
+
+class RelocationError(RunError):
+    """An event cannot be located again, for a reason that its text gives."""
+
+
+class NoClipError(RelocationError):
+    """The event has no recordings."""
+
+
+@dataclass(frozen=True, slots=True)
+class FrameRow:
+    """A frame's place in a recording: see `livessl.server.clips.cut.CutFrame`."""
+
+    frame_index: int
+    begin: int
+    length: int
+    power: float
+    active: bool
+    requested: bool
+
+
+@dataclass(frozen=True, slots=True)
+class StoredArray:
+    """One array of a clip.
+
+    Parameters
+    ----------
+    name : str
+    file : str
+        Name of its recording.
+    microphones_m : (K, 3) float64
+        Positions by which the event was located, metres.
+    uncertainty : Uncertainty
+    time_ns : int
+        Site time of the recording's first sample, in nanoseconds.
+    sample_rate_hz : float
+    rows : tuple of FrameRow
+    """
+
+    name: str
+    file: str
+    microphones_m: FloatArray
+    uncertainty: Uncertainty
+    time_ns: int
+    sample_rate_hz: float
+    rows: tuple[FrameRow, ...]
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the samples when they are decoded, as the frames hold them or as the recording does."""
+        held = max(self.length, sum(row.length for row in self.rows))
+        return held * len(self.microphones_m) * np.dtype(np.float32).itemsize
+
+    @property
+    def length(self) -> int:
+        """Number of samples of each channel up to the end of the last frame."""
+        return max((row.begin + row.length for row in self.rows), default=0)
+
+
+@dataclass(frozen=True, slots=True)
+class StoredSound:
+    """What a clip says of an event's sound.
+
+    Parameters
+    ----------
+    event_id : str
+    start_ns : int
+        Begin of the event, nanoseconds since the epoch.
+    duration_s : float
+    c_m_s : float
+        Speed of sound by which the event was located, m/s.
+    answer : mapping
+        The event as it was located, as the API encodes it: `method`, `status`, `confidence` and `position_m` are there.
+    arrays : tuple of StoredArray
+    """
+
+    event_id: str
+    start_ns: int
+    duration_s: float
+    c_m_s: float
+    answer: Mapping[str, Any]
+    arrays: tuple[StoredArray, ...]
+
+
+def is_relocatable(about: Mapping[str, Any]) -> bool:
+    """Return whether a clip says of its frames what locating again needs."""
+    return bool(about.get("arrays"))
+
+
+def stored_sound(folder: ClipReader, event_id: str) -> StoredSound:
+    """Return what an event's clip says of its sound; reads no recording.
+
+    Raises
+    ------
+    NoClipError
+        If the event has no recordings.
+    RelocationError
+        If an earlier or later release has made the clip, or it is damaged.
+    """
+    about = folder.about(event_id)
+    if about is None:
+        raise NoClipError(f"event {event_id!r} has no recordings; it cannot be located again without its sound")
+    if not is_relocatable(about):
+        raise RelocationError(
+            f"the recordings of {event_id!r} are of an earlier release, which did not store where frames begin; "
+            "locate them with `livessl locate --wav ARRAY=FILE`"
+        )
+    try:
+        return _parsed(about)
+    except _UNREADABLE as error:
+        what = f"{error} is missing" if isinstance(error, KeyError) else str(error)
+        raise RelocationError(
+            f"event {event_id!r}: expected a {ABOUT} that this release can read, got another one: {what}; it is "
+            "damaged or of another release: locate its sound with `livessl locate --wav ARRAY=FILE`, or delete them"
+        ) from error
+
+
+def check_memory(sound: StoredSound, most_bytes: int) -> None:
+    """Refuse a sound whose decoded samples take more than a number of bytes; reads no recording.
+
+    Raises
+    ------
+    RelocationError
+    """
+    nbytes = sum(array.nbytes for array in sound.arrays)
+    if nbytes > most_bytes:
+        raise RelocationError(
+            f"the recordings of {sound.event_id!r} are too large for a running server: expected at most "
+            f"{most_bytes / 1e6:.0f} MB of decoded samples, got {math.ceil(nbytes / 1e6)} MB; locate the event with "
+            "`livessl relocate`, on a machine with the memory"
+        )
+
+
+def stored_frames(folder: ClipReader, event_id: str, array: StoredArray) -> list[Frame]:
+    """Return the frames of one array of a clip.
+
+    Raises
+    ------
+    NoClipError
+        If the recording has been deleted meanwhile.
+    RelocationError
+        If it cannot be read, or is another than `clip.json` describes.
+    """
+    path = folder.file(event_id, array.file)
+    if path is None:
+        raise NoClipError(f"event {event_id!r}: its recording {array.file!r} is gone; it cannot be located again")
+    try:
+        samples = _samples(path, array)
+    except (OSError, soundfile.SoundFileError, ValueError) as error:
+        raise RelocationError(f"event {event_id!r}: {array.file} cannot be read: {error}; delete it") from error
+    frames = []
+    for number, row in enumerate(array.rows, 1):
+        piece = np.ascontiguousarray(samples[:, row.begin : row.begin + row.length])
+        at_ns = array.time_ns + round(1e9 * row.begin / array.sample_rate_hz)
+        sequence = 0 if row.requested else number
+        frames.append(
+            Frame(
+                array.name,
+                sequence,
+                row.frame_index,
+                at_ns,
+                array.sample_rate_hz,
+                piece,
+                row.power,
+                row.active,
+                row.requested,
+            )
+        )
+    return frames
+
+
+def _samples(path: Path, array: StoredArray) -> Float32Array:
+    """Return the samples (channels, n) of a recording up to the end of its last frame, and not more.
+
+    Raises
+    ------
+    OSError, soundfile.SoundFileError, ValueError
+        If it cannot be read, or has other channels or fewer samples than its frames.
+    """
+    channels = len(array.microphones_m)
+    with soundfile.SoundFile(path) as file:
+        if file.channels != channels:
+            raise ValueError(f"expected {channels} channels, as {ABOUT} says, got {file.channels}")
+        samples = file.read(array.length, dtype="float32", always_2d=True)
+    if len(samples) < array.length:
+        raise ValueError(f"expected {array.length} samples, as {ABOUT} says, got {len(samples)}")
+    found: Float32Array = samples.T
+    return found
+
+
+def _parsed(about: Mapping[str, Any]) -> StoredSound:
+    """Return the content of a `clip.json`; raises one of `_UNREADABLE` if something is missing or has another form."""
+    files = {str(each["array"]): str(each["name"]) for each in about["files"] if each["kind"] == "array"}
+    arrays = about["arrays"]
+    found = StoredSound(
+        str(about["event_id"]),
+        int(about["start_ns"]),
+        _positive("duration_s", about["duration_s"]),
+        _positive("c_m_s", about["c_m_s"]),
+        _answer(about["answer"]),
+        tuple(_array(str(name), known, files[name]) for name, known in arrays.items()),
+    )
+    for array in found.arrays:
+        for row in array.rows:
+            off_s = (row.frame_index * FRAME_NS - found.start_ns) / 1e9
+            if abs(off_s) > MOST_OFF_S:
+                raise ValueError(
+                    f"arrays.{array.name}.frames: expected frames within {MOST_OFF_S:.0f} s of the event, "
+                    f"got one {off_s:.0f} s from it"
+                )
+    return found
+
+
+def _answer(answer: Mapping[str, Any]) -> Mapping[str, Any]:
+    if not isinstance(answer["method"], str) or not isinstance(answer["status"], str):
+        raise TypeError(f"answer: expected a method and a status in words, got {answer!r}")
+    float(answer["confidence"])
+    if answer["position_m"] is not None:
+        _x, _y, _z = map(float, answer["position_m"])
+    return answer
+
+
+def _array(name: str, known: Mapping[str, Any], file: str) -> StoredArray:
+    microphones_m = np.array(known["microphones_m"], dtype=np.float64)
+    if microphones_m.shape[1:] != (3,) or not np.isfinite(microphones_m).all():
+        raise ValueError(f"arrays.{name}.microphones_m: expected positions (K, 3), got {known['microphones_m']!r}")
+    uncertainty = Uncertainty(**known["uncertainty"])
+    for value in known["uncertainty"].values():
+        float(value)
+    return StoredArray(
+        name,
+        file,
+        microphones_m,
+        uncertainty,
+        int(known["time_ns"]),
+        _positive(f"arrays.{name}.sample_rate_hz", known["sample_rate_hz"]),
+        tuple(_row(name, row) for row in known["frames"]),
+    )
+
+
+def _row(name: str, row: Sequence[Any]) -> FrameRow:
+    index, begin, length, power, active, requested = row
+    found = FrameRow(int(index), int(begin), int(length), float(power), bool(active), bool(requested))
+    if found.begin < 0 or found.length <= 0:
+        raise ValueError(f"arrays.{name}.frames: expected a begin of 0 or more and a length above 0, got {row!r}")
+    return found
+
+
+def _positive(what: str, value: Any) -> float:
+    number = float(value)
+    if not number > 0.0:
+        raise ValueError(f"{what}: expected a number above 0, got {value!r}")
+    return number
