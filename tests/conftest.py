@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import os
 import signal
+from collections.abc import Iterator
 
 import pytest
 from hypothesis import settings
 from threadpoolctl import threadpool_limits
 
 from livessl.core.locate.peak_search import warm_up
+from livessl.core.methods import METHODS
 from livessl.garbage import collect_as_usual
 
 pytest_plugins = ["api_contract", "history_places"]
@@ -33,6 +35,15 @@ settings.load_profile("livessl")
 def _compiled() -> None:
     """No test's patience is spent on the compiler."""
     warm_up()
+
+
+@pytest.fixture(autouse=True)
+def _methods() -> Iterator[None]:
+    """A method that a test has registered is there for that test only."""
+    before = dict(METHODS)
+    yield
+    METHODS.clear()
+    METHODS.update(before)
 
 
 LONGEST_FIRST = (

@@ -21,7 +21,7 @@ from livessl.capture.dealer import Dealer
 from livessl.capture.link import Link
 from livessl.capture.spool import Spool
 from livessl.clock import utc_ns
-from livessl.core.locate.estimator import Localization, PowerMaps, Sound, register
+from livessl.core.locate.estimator import Localization, PowerMaps, Sound
 from livessl.core.types import FRAME_NS, BackfillRequest, Evidence, Frame, Mark, Message
 from livessl.server.app import assemble
 from livessl.server.fanout import Fanout
@@ -78,9 +78,6 @@ class Fingerprint:
 
     def power_maps(self, evidence: Sequence[Evidence], separately: Collection[str] | None = None) -> PowerMaps:
         raise AssertionError("nobody looks at maps here")
-
-
-register("fingerprint", Fingerprint)
 
 
 class HandClock:
@@ -322,7 +319,7 @@ class World:
         return sounds
 
     def start_server(self) -> None:
-        fusion = self.site.fusion.model_copy(update={"method": "fingerprint"})
+        fusion = self.site.fusion.model_copy(update={"method": "world:Fingerprint"})
         site = self.site.model_copy(update={"fusion": fusion})
         self.post = Post(site, self.clock)
         self.server = assemble(
