@@ -42,4 +42,4 @@ compiling=$!
 mypy
 lint-imports
 wait "$compiling"
-pytest -n 5 --dist loadfile --no-loadscope-reorder "$@"
+pytest -n 4 --dist loadfile --no-loadscope-reorder "$@"

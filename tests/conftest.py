@@ -5,7 +5,9 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Iterator
+from inspect import signature
 
+import httpx
 import pytest
 from hypothesis import settings
 from threadpoolctl import threadpool_limits
@@ -20,6 +22,10 @@ pytest_plugins = ["api_contract", "history_places"]
 # times the processor time of a product.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # for a library that is loaded later
 threadpool_limits(limits=1, user_api="blas")  # for one that is loaded
+
+# A busy machine may need more than the 5 s that httpx gives a request by default; only a hang reaches this.
+usual = signature(httpx.get).parameters["timeout"].default
+usual.connect = usual.read = usual.write = usual.pool = 100.0
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as in a shell's background: children would ignore it, too
     signal.signal(signal.SIGINT, signal.default_int_handler)
