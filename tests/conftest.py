@@ -14,6 +14,7 @@ from threadpoolctl import threadpool_limits
 
 from livessl.core.locate.peak_search import warm_up
 from livessl.core.methods import METHODS
+from livessl.core.stream.load_policy import LoadPolicy
 from livessl.garbage import collect_as_usual
 
 pytest_plugins = ["api_contract", "history_places"]
@@ -50,6 +51,14 @@ def _methods() -> Iterator[None]:
     yield
     METHODS.clear()
     METHODS.update(before)
+
+
+@pytest.fixture(scope="module")
+def nothing_is_shed() -> Iterator[None]:
+    """Servers shed nothing, however busy the machine is."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(LoadPolicy, "note", lambda *_: 0)
+        yield
 
 
 LONGEST_FIRST = (

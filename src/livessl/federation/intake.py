@@ -30,12 +30,12 @@ from livessl.server.forwarding.stream import (
     STREAM,
     connect_options,
     connected,
-    ended,
     health_of_all,
     nats_library,
     parse_message_id,
     parse_subject,
     subjects_of_stream,
+    until_one_ends,
 )
 from livessl.server.history.database import StoreError
 
@@ -130,13 +130,7 @@ class Intake:
 
     async def run(self) -> None:
         """Receive until cancelled, and connect again whenever that is needed."""
-        tasks = asyncio.create_task(self._stay_connected()), asyncio.create_task(self._store_reports())
-        try:
-            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-        finally:
-            await ended(*tasks)
-        for task in done:
-            task.result()  # raises the error that ended it
+        await until_one_ends(self._stay_connected(), self._store_reports())
 
     async def _stay_connected(self) -> None:
         while True:

@@ -1,4 +1,4 @@
-"""What a server reports to its service manager: that it serves, that its fusion goes on, and its condition in words."""
+"""Reports to the service manager of a server that it serves, that its fusion goes on, and its condition in words."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from typing import Final
 
 from livessl.server.api.routes import condition
 from livessl.server.parts import Parts
-from livessl.service_manager import ServiceManager
+from livessl.service_manager import STATUS_NS, ServiceManager
 
-DESCRIBE_S: Final = 1.0
-"""Interval, in seconds, at which the condition is looked at."""
+DESCRIBE_S: Final = STATUS_NS / 1e9
+"""Interval, in seconds, at which the condition is looked at: as often as it is reported."""
 
 _log = logging.getLogger(__name__)
 

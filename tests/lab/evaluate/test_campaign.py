@@ -27,7 +27,7 @@ POSITIONS = 16
 def one_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """Compute in this process, because a worker takes seconds to start."""
     monkeypatch.setattr(
-        campaign, "_by_processes", lambda job, wanted, jobs: (campaign.compute(job, number) for number in wanted)
+        campaign, "on_cores", lambda compute, job, wanted, cores: (compute(job, number) for number in wanted)
     )
 
 

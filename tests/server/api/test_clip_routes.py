@@ -13,7 +13,6 @@ import pytest
 import soundfile
 
 from livessl.clock import utc_ns
-from livessl.core.stream.load_policy import LoadPolicy
 from livessl.core.types import Float32Array
 from livessl.errors import ConfigError
 from livessl.server.app import Server
@@ -21,16 +20,10 @@ from livessl.site.tokens import Role, add_token
 from scene_server import capture_scene, replay_scene
 from small_site import RATE_HZ, Changes, heard, running_server, scene, site_of, wait_until
 
+pytestmark = pytest.mark.usefixtures("nothing_is_shed")
+
 CLIPS: Changes = {"server.clips": {"folder": "clips", "pre_s": 0.6, "post_s": 0.2}}
 ROLES: tuple[Literal["viewer", "operator"], ...] = ("viewer", "operator")
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _patient() -> Iterator[None]:
-    """The server sheds nothing, however busy the machine is."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(LoadPolicy, "note", lambda *_: 0)
-        yield
 
 
 class Desk:

@@ -9,13 +9,12 @@ import pytest
 from playwright.sync_api import Browser, Dialog, Page, expect
 
 from browser import faultless_page, running_browser, visit
-from livessl.core.stream.load_policy import LoadPolicy
 from livessl.server.app import Server
 from livessl.site.tokens import add_token
 from scene_server import capture_scene
 from small_site import HANG_S, Changes, running_server, site_of, wait_until
 
-pytestmark = [pytest.mark.browser]
+pytestmark = [pytest.mark.browser, pytest.mark.usefixtures("nothing_is_shed")]
 
 CLIPS: Changes = {"server.clips": {"folder": "clips"}, "server.http.tokens": "tokens.yaml"}
 CLIPPED = """
@@ -45,14 +44,6 @@ def browser() -> Iterator[Browser]:
 def tokens(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, str]]:
     directory = tmp_path_factory.mktemp("site")
     return directory, {role: add_token(directory / "tokens.yaml", role, role) for role in ("viewer", "operator")}
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _patient() -> Iterator[None]:
-    """The server sheds nothing, however busy the machine is."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(LoadPolicy, "note", lambda *_: 0)
-        yield
 
 
 @pytest.fixture(scope="module")

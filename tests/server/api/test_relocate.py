@@ -14,7 +14,6 @@ import httpx
 import numpy as np
 import pytest
 
-from livessl.core.stream.load_policy import LoadPolicy
 from livessl.core.types import Frame
 from livessl.server.app import Server
 from livessl.server.clips import relocate as relocation
@@ -25,16 +24,10 @@ from messages import event_message
 from scene_server import capture_scene
 from small_site import HANG_S, Changes, running_server, scene, site_of, wait_until
 
+pytestmark = pytest.mark.usefixtures("nothing_is_shed")
+
 CLIPS: Changes = {"server.clips": {"folder": "clips", "enhanced": False}, "server.http.tokens": "tokens.yaml"}
 ROLES: tuple[Literal["viewer", "operator"], ...] = ("viewer", "operator")
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _patient() -> Iterator[None]:
-    """The server sheds nothing, however busy the machine is."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(LoadPolicy, "note", lambda *_: 0)
-        yield
 
 
 class Desk:

@@ -5,14 +5,10 @@ from __future__ import annotations
 import json
 import os
 import resource
-import signal
 import threading
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures import as_completed as completed
 from dataclasses import dataclass
 from io import BytesIO
-from multiprocessing import active_children, get_context, parent_process
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +18,7 @@ from threadpoolctl import threadpool_limits
 
 from livessl.lab.evaluate.job import Job, Unit
 from livessl.lab.evaluate.parquet import write_smallest
+from livessl.workers import on_cores
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +71,7 @@ def run_campaign(
     if progress is not None:
         progress(finished, total)
     if wanted:
-        source = _by_dask(job, wanted, scheduler) if scheduler else _by_processes(job, wanted, jobs)
+        source = _by_dask(job, wanted, scheduler) if scheduler else on_cores(compute, job, wanted, jobs)
         with (out / "cost.jsonl").open("a", encoding="utf-8") as costs:
             for done in source:
                 _write(_part(parts, done.position), done.parquet)
@@ -111,7 +108,6 @@ def compute(job: Job, number: int) -> Done:
 
 _kept: dict[str, Unit] = {}
 _keeping = threading.Lock()
-_sent: list[Job] = []
 
 
 def _worker(job: Job) -> Unit:
@@ -122,39 +118,6 @@ def _worker(job: Job) -> Unit:
             _kept.clear()
             _kept[key] = job.unit()
         return _kept[key]
-
-
-def _by_processes(job: Job, wanted: list[int], jobs: int) -> Iterator[Done]:
-    others = set(active_children())
-    pool = ProcessPoolExecutor(
-        min(jobs, len(wanted)), mp_context=get_context("spawn"), initializer=_begin, initargs=(job,)
-    )
-    try:  # a `with` would wait, on Ctrl-C, for every position not yet computed
-        for future in completed([pool.submit(_compute_sent, number) for number in wanted]):
-            yield future.result()
-    except BaseException:
-        for worker in set(active_children()) - others:
-            worker.kill()  # it may be compiling for a minute, and has nothing to lose
-        raise
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
-
-
-def _begin(job: Job) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
-    _sent[:] = [job]
-    parent = parent_process()
-    assert parent is not None
-
-    def end_with_parent() -> None:
-        parent.join()
-        os._exit(1)  # a killed parent cannot stop its workers
-
-    threading.Thread(target=end_with_parent, daemon=True).start()
-
-
-def _compute_sent(number: int) -> Done:
-    return compute(_sent[0], number)
 
 
 def _by_dask(job: Job, wanted: list[int], scheduler: str | None) -> Iterator[Done]:

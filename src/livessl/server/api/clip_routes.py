@@ -26,6 +26,14 @@ MEDIA_TYPES: Final = {".flac": "audio/flac", ".wav": "audio/wav"}
 
 _BINARY: Final[dict[str, Any]] = {"schema": {"type": "string", "format": "binary"}}
 _TEXT: Final[dict[str, Any]] = {"text/plain; charset=utf-8": {"schema": {"type": "string"}}}
+_SOUND: Final[dict[int | str, dict[str, Any]]] = {
+    200: {"description": "The recording.", "content": dict.fromkeys(MEDIA_TYPES.values(), _BINARY)},
+    206: {"description": "The part that `Range` asks for.", "content": {"audio/flac": _BINARY}},
+    400: {"description": "`Range` is malformed.", "content": _TEXT},
+    416: {"description": "`Range` lies beyond the end.", "content": _TEXT},
+}
+"""Answers with sound, by status."""
+
 _NO_CLIP: Final = "The event has no recordings."
 _NO_FILE: Final = "The event has no recording of that name."
 _DISK: Final = "The folder of the clips cannot be written."
@@ -99,13 +107,7 @@ def _add_recordings(router: APIRouter, clips: Clips | None) -> None:
     @router.get(
         "/events/{event_id}/clips/best",
         response_class=Response,
-        responses={
-            200: {"description": "The recording.", "content": dict.fromkeys(MEDIA_TYPES.values(), _BINARY)},
-            206: {"description": "The part that `Range` asks for.", "content": {"audio/flac": _BINARY}},
-            400: {"description": "`Range` is malformed.", "content": _TEXT},
-            416: {"description": "`Range` lies beyond the end.", "content": _TEXT},
-            **errors(404, texts={404: "The event has no recordings, or none yet."}),
-        },
+        responses=_SOUND | errors(404, texts={404: "The event has no recordings, or none yet."}),
     )
     def get_best_clip(event_id: str) -> Response:
         """The recording that people listen to first, the enhanced one if there is one; for operators."""
@@ -119,13 +121,7 @@ def _add_recordings(router: APIRouter, clips: Clips | None) -> None:
     @router.get(
         "/events/{event_id}/clips/{name}",
         response_class=Response,
-        responses={
-            200: {"description": "The recording.", "content": dict.fromkeys(MEDIA_TYPES.values(), _BINARY)},
-            206: {"description": "The part that `Range` asks for.", "content": {"audio/flac": _BINARY}},
-            400: {"description": "`Range` is malformed.", "content": _TEXT},
-            416: {"description": "`Range` lies beyond the end.", "content": _TEXT},
-            **errors(404, texts={404: _NO_FILE}),
-        },
+        responses=_SOUND | errors(404, texts={404: _NO_FILE}),
     )
     def get_clip(
         event_id: str,

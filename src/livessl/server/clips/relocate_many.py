@@ -4,13 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
-import signal
-import threading
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
-from multiprocessing import active_children, get_context, parent_process
+from functools import cached_property
 from pathlib import Path
 
 from threadpoolctl import threadpool_limits
@@ -23,9 +19,10 @@ from livessl.server.clips.folder import ClipReader
 from livessl.server.clips.relocate import SetUp, distance_m, relocate
 from livessl.server.clips.stored_sound import RelocationError, stored_sound
 from livessl.site.models import Site
+from livessl.workers import on_cores
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Task:
     """What all events are located again with.
 
@@ -45,7 +42,7 @@ class Task:
     method: str | None
     set_up: SetUp
 
-    @property
+    @cached_property
     def digest(self) -> str:
         """Digest of everything but the clips that decides the answers.
 
@@ -113,37 +110,9 @@ def relocate_many(task: Task, event_ids: Sequence[str], jobs: int) -> Iterator[J
     if jobs == 1 or len(event_ids) < 2:
         yield from (relocate_one(task, event_id) for event_id in event_ids)
         return
-    others = set(active_children())
-    pool = ProcessPoolExecutor(
-        min(jobs, len(event_ids)), mp_context=get_context("spawn"), initializer=_begin, initargs=(task,)
-    )
-    try:  # a `with` would wait, on Ctrl-C, for every event not yet located
-        for future in as_completed([pool.submit(_relocate_sent, event_id) for event_id in event_ids]):
-            yield future.result()
-    except BaseException:
-        for worker in set(active_children()) - others:
-            worker.kill()
-        raise
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
+    yield from on_cores(_relocate_on_one_core, task, event_ids, jobs)
 
 
-_sent: list[Task] = []
-
-
-def _begin(task: Task) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
-    _sent[:] = [task]
-    threadpool_limits(limits=1)
-    parent = parent_process()
-    assert parent is not None
-
-    def end_with_parent() -> None:
-        parent.join()
-        os._exit(1)  # a killed parent cannot stop its workers
-
-    threading.Thread(target=end_with_parent, daemon=True).start()
-
-
-def _relocate_sent(event_id: str) -> JsonObject:
-    return relocate_one(_sent[0], event_id)
+def _relocate_on_one_core(task: Task, event_id: str) -> JsonObject:
+    with threadpool_limits(limits=1):
+        return relocate_one(task, event_id)

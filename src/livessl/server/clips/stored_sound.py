@@ -16,6 +16,7 @@ import soundfile
 
 from livessl.core.types import FRAME_NS, Float32Array, FloatArray, Frame, Uncertainty
 from livessl.errors import RunError
+from livessl.server.clips.cut import CutFrame
 from livessl.server.clips.folder import ABOUT, ClipReader
 
 MOST_BYTES: Final = 256_000_000
@@ -39,18 +40,6 @@ class NoClipError(RelocationError):
 
 
 @dataclass(frozen=True, slots=True)
-class FrameRow:
-    """A frame's place in a recording: see `livessl.server.clips.cut.CutFrame`."""
-
-    frame_index: int
-    begin: int
-    length: int
-    power: float
-    active: bool
-    requested: bool
-
-
-@dataclass(frozen=True, slots=True)
 class StoredArray:
     """One array of a clip.
 
@@ -65,7 +54,7 @@ class StoredArray:
     time_ns : int
         Site time of the recording's first sample, in nanoseconds.
     sample_rate_hz : float
-    rows : tuple of FrameRow
+    rows : tuple of CutFrame
     """
 
     name: str
@@ -74,7 +63,7 @@ class StoredArray:
     uncertainty: Uncertainty
     time_ns: int
     sample_rate_hz: float
-    rows: tuple[FrameRow, ...]
+    rows: tuple[CutFrame, ...]
 
     @property
     def nbytes(self) -> int:
@@ -269,9 +258,9 @@ def _array(name: str, known: Mapping[str, Any], file: str) -> StoredArray:
     )
 
 
-def _row(name: str, row: Sequence[Any]) -> FrameRow:
+def _row(name: str, row: Sequence[Any]) -> CutFrame:
     index, begin, length, power, active, requested = row
-    found = FrameRow(int(index), int(begin), int(length), float(power), bool(active), bool(requested))
+    found = CutFrame(int(index), int(begin), int(length), float(power), bool(active), bool(requested))
     if found.begin < 0 or found.length <= 0:
         raise ValueError(f"arrays.{name}.frames: expected a begin of 0 or more and a length above 0, got {row!r}")
     return found

@@ -29,10 +29,10 @@ from livessl.server.forwarding.stream import (
     Place,
     connect_options,
     connected,
-    ended,
     message_id,
     nats_library,
     subject,
+    until_one_ends,
 )
 from livessl.server.history.backlog import Backlog, Write
 from livessl.server.history.database import StoreError
@@ -216,13 +216,7 @@ class HubLink:
 
     async def _work(self) -> None:
         """Send until `stop`."""
-        sending, ending = asyncio.create_task(self._stay_connected()), asyncio.create_task(self._end.wait())
-        try:
-            done, _ = await asyncio.wait((sending, ending), return_when=asyncio.FIRST_COMPLETED)
-        finally:
-            await ended(sending, ending)
-        if sending in done:
-            sending.result()  # raises the error that ended it
+        await until_one_ends(self._stay_connected(), self._end.wait())
 
     async def _stay_connected(self) -> None:
         """Connect, send as long as the connection lasts, and connect again, until cancelled."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import secrets
 import ssl
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine
 from contextlib import asynccontextmanager, suppress
 from importlib import import_module
 from pathlib import Path
@@ -148,6 +148,17 @@ async def connected(
         with suppress(Exception):
             async with asyncio.timeout(CLOSE_S):
                 await client.close()
+
+
+async def until_one_ends(*works: Coroutine[Any, Any, object]) -> None:
+    """Do some works at a time until one of them ends, and end the others; raise the error that has ended it."""
+    tasks = [asyncio.create_task(work) for work in works]
+    try:
+        done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        await ended(*tasks)
+    for task in done:
+        task.result()
 
 
 async def ended(*tasks: asyncio.Task[Any]) -> None:
