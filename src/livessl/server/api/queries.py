@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Collection, Iterable
 from difflib import get_close_matches
 from typing import Annotated, Final
 
+import orjson
 from fastapi import HTTPException, Request, Response
 from fastapi.dependencies.models import Dependant
 from fastapi.encoders import jsonable_encoder
@@ -137,14 +137,14 @@ def unprocessable(name: str, what: str, part: str = "query") -> HTTPException:
 
 
 async def refuse_request(_request: Request, error: Exception) -> Response:
-    """Answer 422 with the faults of a request, without the values if JSON cannot hold them: NaN, or deep nesting."""
+    """Answer 422 with the faults of a request, without the values if JSON cannot hold them, such as deep nesting."""
     assert isinstance(error, RequestValidationError)
     faults = error.errors()
     try:
-        body = json.dumps({"detail": jsonable_encoder(faults)}, allow_nan=False)
-    except (ValueError, RecursionError):
+        body = orjson.dumps({"detail": jsonable_encoder(faults)})
+    except (TypeError, RecursionError):
         told = [{name: fault[name] for name in ("type", "loc", "msg")} for fault in faults]
-        body = json.dumps({"detail": told})
+        body = orjson.dumps({"detail": jsonable_encoder(told)})
     return Response(body, 422, media_type="application/json")
 
 
