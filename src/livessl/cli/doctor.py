@@ -12,7 +12,7 @@ from livessl.cli import progress
 from livessl.cli.exits import FAILED, OK
 from livessl.cli.options import add_joint, add_json, add_wav, joints, read_site, wavs
 from livessl.cli.output import complain, print_warnings
-from livessl.cli.server_answers import add_server, ask
+from livessl.cli.server_answers import add_server, ask_for
 from livessl.errors import UseError
 
 if TYPE_CHECKING:
@@ -75,14 +75,13 @@ def _examine(arguments: argparse.Namespace) -> Examination:
 
 def _ask(url: str, token_file: Path | None) -> Examination:
     """Return what a running server has found."""
-    from livessl.core.commission.finding import Finding, Severity
+    from livessl.core.commission.finding import Finding
     from livessl.examination import Examination
+    from livessl.schema.answers import Findings
 
-    answer = ask(url, "findings", token_file)
-    for finding in answer["findings"]:
-        del finding["kind"]
-        finding["severity"] = Severity(finding["severity"])
-    return Examination(tuple(Finding(**finding) for finding in answer["findings"]), answer["sounds"])
+    answer = ask_for(Findings, url, "findings", token_file)
+    found = tuple(Finding(**one.model_dump(exclude={"kind"})) for one in answer.findings)
+    return Examination(found, answer.sounds)
 
 
 def recordings_given(
