@@ -26,7 +26,7 @@ from small_site import HANG_S, site_of
 TURNED = Finding("turned", "south", None, Severity.ERROR, 0.9, "'south' is turned", "turn it back")
 CONTRADICTION = Finding("moved", None, None, Severity.ERROR, 0.5, "the arrays contradict each other", "clap")
 WEAK = Finding("level", "north", 2, Severity.WARNING, 0.9, "channel 2 of 'north' is weaker", "set the gains alike")
-HIDDEN = (BlindSpot("moved", ("north", "south"), 0.8, (1.0, 0.0, 0.0)),)
+HIDDEN = BlindSpot("moved", ("north", "south"), 0.8, (1.0, 0.0, 0.0))
 SOUND = replace(sound(), received=cast(Any, ("north", "south")))  # what was received is not looked at
 
 
@@ -54,6 +54,11 @@ class Desk:
         for _ in range(sounds):
             self.watch.take(SOUND)
             self.watch.examine()
+
+    def said(self) -> tuple[list[Finding], list[BlindSpot]]:
+        """The findings, and what the sounds hide."""
+        state = self.watch.state
+        return list(state.findings), list(state.blind_spots)
 
     def _find(self, _site: object, sounds: Sequence[object]) -> list[Finding]:
         self.examined.append(len(sounds))
@@ -137,24 +142,24 @@ def test_array_with_a_wrong_clock_has_no_part_in_the_examination(desk: Desk, mon
 
 
 def test_what_the_sounds_hide_is_published_while_no_finding_is_about_poses(desk: Desk) -> None:
-    desk.hidden = HIDDEN
+    desk.hidden = (HIDDEN,)
     desk.hear([WEAK], LEAST_SOUNDS - 1)
-    assert desk.watch.state.blind_spots == ()
+    assert desk.said() == ([], [])
     desk.hear([WEAK])
-    assert (desk.watch.state.findings, desk.watch.state.blind_spots) == ((WEAK,), HIDDEN)
-    desk.hear([TURNED], KEPT_SOUNDS)
-    assert (desk.watch.state.findings, desk.watch.state.blind_spots) == ((TURNED,), ())
-    desk.hear([])
-    assert (desk.watch.state.findings, desk.watch.state.blind_spots) == ((TURNED,), ())  # the finding has not ended yet
-    desk.hear([], MOST_CONFIRMING)
-    assert (desk.watch.state.findings, desk.watch.state.blind_spots) == ((), HIDDEN)
+    assert desk.said() == ([WEAK], [HIDDEN])
+    desk.hear([WEAK, TURNED], KEPT_SOUNDS)
+    assert desk.said() == ([TURNED, WEAK], [])
+    desk.hear([WEAK])
+    assert desk.said() == ([TURNED, WEAK], [])  # TURNED has not ended yet
+    desk.hear([], KEPT_SOUNDS)
+    assert desk.said() == ([], [HIDDEN])
 
 
 @pytest.mark.parametrize("ends", ["another run", "other poses", "a clock that is off"])
 def test_what_the_sounds_hide_ends_with_what_it_was_said_of(desk: Desk, ends: str) -> None:
-    desk.hidden = HIDDEN
+    desk.hidden = (HIDDEN,)
     desk.hear([], LEAST_SOUNDS)
-    assert desk.watch.state.blind_spots == HIDDEN
+    assert desk.said() == ([], [HIDDEN])
     if ends == "another run":
         desk.watch.forget()
     elif ends == "other poses":
@@ -162,7 +167,7 @@ def test_what_the_sounds_hide_ends_with_what_it_was_said_of(desk: Desk, ends: st
     else:
         desk.watch._sounds = ()  # what was received is not looked at here
         desk.watch.note_clocks(["south"])
-    assert desk.watch.state.blind_spots == ()
+    assert desk.said() == ([], [])
 
 
 def test_another_run_begins_without_findings(desk: Desk) -> None:
