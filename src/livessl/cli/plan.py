@@ -35,7 +35,8 @@ def add_arguments(parser: Any) -> None:
         type=argument.above_zero,
         default=CALIBRATION_M,
         metavar="M",
-        help=f"standard deviation of the microphone positions, metres (default {CALIBRATION_M:g})",
+        help="how exactly the positions of microphones are known, standard deviation in metres "
+        f"(default {CALIBRATION_M:g})",
     )
     add_json(parser, "print one JSON object")
     parser.add_argument("--out", type=Path, metavar="DIR", help="also write plan.json and plan.png to DIR")
