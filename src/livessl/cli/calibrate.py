@@ -128,7 +128,7 @@ def _action(actions: Any, name: str, act: Callable[[argparse.Namespace], int], t
         epilog=f"example: livessl calibrate {example}",
     )
     sub.set_defaults(act=act)
-    add_recordings(sub, "site file (default: the session's own); if no recordings are given, the server that it describes is used")
+    add_recordings(sub, "site file (default: the session's own); without recordings, its running server is used")
     add_server(sub, "the command prompts for each clap and waits for it")
     sub.add_argument(
         "--wait",
