@@ -1,7 +1,7 @@
 """Judges alternative set-ups by how well they explain sounds with the small freedom that every set-up has.
 
-All set-ups are fitted together. Only the few that explain the sounds about as well as the best one are fitted to the
-end.
+The set-ups are fitted together. Other orders of channels and large turns are many: `hypotheses` ranks them at the
+points of a grid, and only the best of them are fitted.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ COSTS: Final = {
     "temperature": 2.0,
 }
 """Deviance that an alternative must gain to be as good as the set-up as filed: two for each unknown (Akaike), one for
-each channel in another order. A shift, and a turn about any axis, cost two more than their three unknowns, because
-people err most often about the turn around the vertical (`UPRIGHT_COST`). A displaced microphone costs two more,
-because there are many microphones."""
+each channel in another order. A shift, and a turn about any axis, cost two more than their three unknowns, because the
+turn about the vertical alone (`UPRIGHT_COST`) is what people get wrong most often. A displaced microphone costs two
+more, because there are many microphones."""
 
 MOST_SLOPES: Final = 500_000
 """Most slopes (set-ups by sounds by channels by unknowns) of one array that are computed at one time: 4 MB."""
