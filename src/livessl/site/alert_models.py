@@ -22,10 +22,10 @@ Seconds = Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)]
 
 
 LIFETIME_S: Final = 86_400.0
-"""Time, in seconds, for which a link opens something without a token: whoever was away for a day can still look."""
+"""Default lifetime of a link that needs no token, in seconds: a day, so that people who were away can still look."""
 
 LinkLifetimeS = Annotated[float, Field(ge=60, le=2_592_000)]
-"""Such a time in seconds, at most 30 days: a link cannot be taken back alone."""
+"""Lifetime of a link that needs no token, in seconds: at most 30 days, because a single link cannot be revoked."""
 
 T = TypeVar("T")
 
