@@ -26,13 +26,13 @@ def add_site(parser: Any) -> None:
     parser.add_argument("--site", type=Path, required=True, help="site file")
 
 
-def add_method(parser: Any) -> None:
-    """Add --method."""
+def add_method(parser: Any, default: str = "the site's") -> None:
+    """Add --method; `default` names the method without it."""
     parser.add_argument(
         "--method",
         type=argument.method,
         metavar=f"{{{','.join(sorted(METHODS))},MODULE:NAME}}",
-        help="localization method; MODULE:NAME imports one of your own (default: the site's)",
+        help=f"localization method; MODULE:NAME imports one of your own (default: {default})",
     )
 
 

@@ -28,7 +28,7 @@ def add_arguments(parser: Any) -> None:
         "--height",
         type=argument.not_negative,
         metavar="M",
-        help="height of the sounds, metres (default 1.5, or the middle of the search volume if that ends below 1.5 m)",
+        help="height of the sounds, metres (default 1.5, or the middle of a search volume that ends below 1.5 m)",
     )
     parser.add_argument(
         "--calibration",

@@ -28,7 +28,7 @@ def add_arguments(parser: Any) -> None:
     add = parser.add_argument
     add("clips", type=Path, nargs="?", help="folder of clips (default: that of server.clips in the site file)")
     add_site(parser)
-    add_method(parser)
+    add_method(parser, "that by which each event was located")
     add_joint(parser)
     add(
         "--set-up",
