@@ -201,7 +201,7 @@ class _Lead:
         self._since_ns = clock.monotonic_ns()
 
     def exceeds(self, most_ns: int, end_ns: int) -> bool:
-        """Return True if more than `most_ns` before `end_ns` is not settled yet, and the server still makes progress."""
+        """Return True if more than `most_ns` before `end_ns` is not settled, and the server still makes progress."""
         if self._link.settled != self._settled or self._link.pending:
             self._settled, self._since_ns = self._link.settled, self._clock.monotonic_ns()
         if self._settled is None or end_ns - self._settled * FRAME_NS <= most_ns:

@@ -1,8 +1,8 @@
 """Refines the poses of arrays and the speed of sound from sounds at unknown places, with at least one array known.
 
 The places of the sounds and the poses are estimated together. The delays within the arrays are enough: the arrays need
-no common clock. Where some arrays have one, the times between these arrays determine distances. Sounds at unknown places
-do not show where in the room the whole set-up is, so one array at least stays as it is filed.
+no common clock. Where some arrays have one, the times between these arrays determine distances. Sounds at unknown
+places do not show where in the room the whole set-up is, so one array at least stays as it is filed.
 """
 
 from __future__ import annotations
