@@ -30,9 +30,9 @@ def add_arguments(parser: Any) -> None:
     add_json(parser, "print one JSON object per finding")
 
 
-def add_recordings(parser: Any) -> None:
-    """Add --site, --session, --wav, --channels and --joint, which `recordings_given` reads."""
-    parser.add_argument("--site", type=Path, help="site file (default: the session's own)")
+def add_recordings(parser: Any, site: str = "site file (default: the session's own)") -> None:
+    """Add --site with a help text, --session, --wav, --channels and --joint, which `recordings_given` reads."""
+    parser.add_argument("--site", type=Path, help=site)
     parser.add_argument(
         "--session", action="append", type=Path, default=[], metavar="DIR", help="recorded session; repeatable"
     )
