@@ -210,6 +210,7 @@ class Findings(Versioned):
     sounds: int = Field(ge=0, description="Number of sounds that were examined; three are the least.", examples=[12])
     findings: list[Finding]
     blind_spots: list[BlindSpot] = Field(
+        default=[],  # of a server that is older than the field
         description="What these sounds cannot show about poses. Empty with fewer than three sounds of two arrays, and "
         "while a finding is about poses: then sizes would not hold."
     )
