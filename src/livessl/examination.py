@@ -9,13 +9,12 @@ import numpy as np
 
 from livessl import offline
 from livessl.clock import UnpacedClock
-from livessl.core.commission.blind_spots import BlindSpot
+from livessl.core.commission.blind_spot import BlindSpot
 from livessl.core.commission.channels import ChannelMeter
 from livessl.core.commission.clocks import Rises, find_clock_faults
 from livessl.core.commission.crosstalk import CrosstalkMeter
 from livessl.core.commission.envelopes import EnvelopeMeter
-from livessl.core.commission.finding import Finding, Severity, in_order
-from livessl.core.commission.findings import OF_SET_UP
+from livessl.core.commission.finding import OF_SET_UP, Finding, Severity, are_poses_in_doubt, in_order
 from livessl.core.commission.observe import observe
 from livessl.core.types import Event, Observation
 from livessl.recordings.assign import AssignedRecording
@@ -123,9 +122,8 @@ def conclude(site: Site, gathered: Gathered) -> Examination:
     """Draw the conclusions from what was gathered."""
     findings = [*gathered.findings, *find_set_up_faults(site, gathered.sounds), *layout_findings(site)]
     told = in_order(with_inputs(site, _without_consequences(findings)))
-    is_known = all(one.fault not in OF_SET_UP and one.fault != "clock" for one in told)
     # the size of a blind spot is computed from the filed set-up, so it needs one without known faults
-    hidden = hidden_by(site, gathered.sounds) if is_known else ()
+    hidden = () if are_poses_in_doubt(told) else hidden_by(site, gathered.sounds)
     return Examination(tuple(told), len(gathered.sounds), hidden)
 
 

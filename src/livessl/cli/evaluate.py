@@ -62,7 +62,7 @@ def _add_simulation(group: Any) -> None:
     add = group.add_argument
     add("--positions", type=argument.positive, metavar="N", help="source positions (default: as many as in the paper)")
     add("--rt", metavar="S,S,…", help="reverberation times in seconds, such as 0,0.4, or a range such as 0:2:0.2")
-    add("--seed", type=int, default=0, help="random seed; the same seed gives the same results (default 0)")
+    add("--seed", type=argument.seed, default=0, help="random seed; the same seed gives the same results (default 0)")
     add("--classes", default=",".join(CLASSES), help=f"classes of sounds (default {','.join(CLASSES)})")
     add(
         "--snr",

@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--zone", help="print only what is inside this zone")
     add(
         "--min-confidence",
-        type=float,
+        type=argument.probability,
         metavar="C",
         help="print only events and updates of at least this confidence, 0 to 1",
     )

@@ -26,7 +26,7 @@ def add_arguments(parser: Any) -> None:
         "--inputs", type=argument.positive, metavar="N", help="number of inputs (default: all that the device has)"
     )
     parser.add_argument(
-        "--sample-rate", type=argument.above_zero, metavar="HZ", help="sampling rate with --device (default: its own)"
+        "--sample-rate", type=argument.sample_rate, metavar="HZ", help="sampling rate with --device (default: its own)"
     )
     parser.add_argument("--seconds", type=argument.above_zero, metavar="N", help="end after N s (default: at Ctrl-C)")
     parser.add_argument("--tap", action="store_true", help="report which microphone you tap")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import errno
 import os
 import sys
 from collections.abc import Sequence
@@ -132,11 +133,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # the program that reads our output, such as `head`, has ended
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return OK
-    except (RunError, OSError) as error:
+    except RunError as error:
         complain(str(error))
+        return FAILED
+    except OSError as error:
+        complain(_of_file(error))
         return FAILED
     except KeyboardInterrupt:
         return INTERRUPTED
+
+
+def _of_file(error: OSError) -> str:
+    """Return the file that an error is about, what is wrong with it and what to do."""
+    if error.filename is None or error.strerror is None:
+        return str(error)
+    full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+    return f"{error.filename}: {error.strerror}; {'free some space' if full else 'correct the path or its permissions'}"
 
 
 def _parser(given: Sequence[str]) -> argparse.ArgumentParser:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from livessl.cli import argument
 from livessl.core.methods import METHODS
-from livessl.errors import ConfigError, Fault
+from livessl.errors import ConfigError, Fault, UseError
 
 if TYPE_CHECKING:
     from livessl.site.models import Site
@@ -96,6 +96,21 @@ def add_wav(parser: Any, text: str, *, hint: str = "", required: bool = False) -
         metavar="ARRAY=1,2,3,4",
         help="channels of ARRAY's files, in the order of its microphones in the site file, counted from 1",
     )
+
+
+def make_folder(path: Path, option: str) -> None:
+    """Make the folder that a command writes to, if there is none.
+
+    Raises
+    ------
+    UseError
+        If it cannot be made.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        what = "expected a folder, got a file" if isinstance(error, FileExistsError) else error.strerror or str(error)
+        raise UseError(f"{option} {path}: cannot be made: {what}; name another folder") from error
 
 
 def read_site(arguments: argparse.Namespace) -> Site:

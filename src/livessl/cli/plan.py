@@ -9,7 +9,7 @@ from typing import Any
 
 from livessl.cli import argument, progress
 from livessl.cli.exits import OK, WRONG_USE
-from livessl.cli.options import add_json, add_site
+from livessl.cli.options import add_json, add_site, make_folder
 from livessl.cli.output import complain
 from livessl.lab.plan.defaults import CALIBRATION_M
 
@@ -50,6 +50,7 @@ def run(arguments: argparse.Namespace) -> int:
     site = load_site(arguments.site)
     if arguments.out is not None:
         figure.require_matplotlib()
+        make_folder(arguments.out, "--out")
     try:
         with progress.counted("trying positions", "array") as bar:
             plan = design.make_plan(site, arguments.rt60, arguments.height, arguments.calibration, bar)
@@ -58,7 +59,6 @@ def run(arguments: argparse.Namespace) -> int:
         return WRONG_USE
     result = words.as_json(plan)
     if arguments.out is not None:
-        arguments.out.mkdir(parents=True, exist_ok=True)
         (arguments.out / "plan.json").write_text(json.dumps(result, allow_nan=False) + "\n", encoding="utf-8")
         figure.draw(plan, arguments.out / "plan.png")
     print(json.dumps(result, allow_nan=False) if arguments.json else words.as_text(plan))

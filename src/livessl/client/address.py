@@ -64,7 +64,7 @@ class Address:
         UseError
             If the URL is none of HTTP, or the file with certificates cannot be used.
         """
-        _check(url)
+        check_url(url)
         if token is not None and not (token.isascii() and token.isprintable()):
             raise UseError("token: expected the text that `livessl keys token` printed, got other characters")
         secure = url.startswith("https://")
@@ -157,7 +157,7 @@ def may_pass(status: int) -> bool:
     return status >= 500 or status in TEMPORARY
 
 
-def _check(url: str) -> None:
+def check_url(url: str) -> None:
     """Raise `UseError` unless `url` names a server."""
     example = "url: expected an address such as http://127.0.0.1:8000"
     try:

@@ -15,11 +15,6 @@ from livessl.core.commission.places import Delays, Microphones, stacked
 from livessl.core.commission.set_up import DELAY_STD_S, Freedom, Known, careful
 from livessl.core.types import BoolArray, FloatArray, Observation
 
-OF_SET_UP: Final = frozenset(
-    {"swapped", "mirrored", "exchanged", "turned", "moved", "late_channel", "geometry", "temperature"}
-)
-"""Codes of what the delays of all sounds show together."""
-
 EXACT_S: Final = 2e-6
 """Standard deviation, in seconds, of a delay whose pairs agree perfectly: converters and microphones differ by as
 much."""
