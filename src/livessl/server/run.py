@@ -10,7 +10,7 @@ from livessl.core.stream.correlation_cache import ForEach
 from livessl.core.stream.final_pass import TwoPassFusion
 from livessl.server.api.encode import Messages
 from livessl.server.store import Finalized
-from livessl.server.zones.shapes import ZoneMap
+from livessl.server.zones.zone_map import ZoneMap
 from livessl.site.build.fusion import make_clock_offsets, make_two_pass_fusion
 from livessl.site.models import Site
 

@@ -14,7 +14,7 @@ from livessl.clock import utc_text
 from livessl.core.stream.activity import ActivityParameters
 from livessl.core.stream.array_health import ArrayStatus
 from livessl.core.types import FRAME_S, Contribution, Estimate, Event, Track, Update
-from livessl.server.zones.shapes import ZoneMap, fixed_zones
+from livessl.server.zones.zone_map import ZoneMap, fixed_zones
 from livessl.site.models import Site
 
 API_VERSION: Final = 1
