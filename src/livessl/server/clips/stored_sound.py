@@ -28,7 +28,7 @@ MOST_OFF_S: Final = 3600.0
 between, so that one damaged index would never end."""
 
 _SPEEDS_M_S: Final = (100.0, 2000.0)
-_RATES_HZ: Final = (1.0, 1e6)
+_RATES_HZ: Final = (100.0, 1e6)
 _MOST_M: Final = 1000.0
 _MOST_UNCERTAINTY: Final = 100.0
 """Limits of the speed of sound, the sampling rate, the coordinates of microphones, and of what they may be off by, as a
