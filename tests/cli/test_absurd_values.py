@@ -35,6 +35,7 @@ URL = "http://127.0.0.1:9"
         ("simulate --site s.yaml --out d --count 1000000001", "expected a whole number >= 1, got '1000000001'"),
         ("events --min-confidence nan", "expected a number from 0 to 1, got 'nan'"),
         ("events --min-confidence 1.5", "expected a number from 0 to 1, got '1.5'"),
+        ("capture --site s.yaml --node n --start-at 0001-01-01T00:00:00Z", "expected one in the years 1701 to 2239"),
         ("events --track 1.5", "expected a whole number >= 0, got '1.5'"),
         ("doctor --url http://[", "--url: expected an address such as http://127.0.0.1:8000, got 'http://['"),
         ("calibrate verify --at 1,1,1 --url http://x:99999", "--url: expected an address such as"),

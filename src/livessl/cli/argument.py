@@ -92,9 +92,9 @@ def key(text: str) -> bytes:
 
 def time(text: str) -> int:
     """Return an RFC 3339 time as nanoseconds UTC."""
-    from livessl.clock import utc_ns
+    from livessl.clock import recordable_ns
 
-    return _read(text, utc_ns)
+    return _read(text, recordable_ns)
 
 
 def positive(text: str) -> int:

@@ -6,7 +6,7 @@ import argparse
 import json
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from livessl.cli import progress
 from livessl.cli.exits import FAILED, OK
@@ -23,6 +23,10 @@ if TYPE_CHECKING:
     from livessl.examination import Examination
     from livessl.recordings.assign import AssignedRecording
     from livessl.site.models import Site
+
+MOST_SHIFT_M: Final = 1000.0
+MOST_TURN_DEG: Final = 180.0
+"""Shift, in metres, and turn, in degrees, from which the size of what the sounds cannot show is left out: any size."""
 
 
 def add_arguments(parser: Any) -> None:
@@ -124,9 +128,12 @@ def blind_spot_lines(spots: Sequence[BlindSpot]) -> list[str]:
     for spot in spots:
         names = " or ".join(repr(name) for name in spot.arrays)
         along = ", ".join(f"{x:.2f}" for x in spot.along)
-        how = f"moved by less than {spot.least:.1f} m along ({along})"
         if spot.fault == "turned":
-            how = f"turned by less than {spot.least:.0f} degrees about ({along})"
+            size = f" by less than {spot.least:.0f} degrees" if spot.least < MOST_TURN_DEG else ""
+            how = f"turned{size} about ({along})"
+        else:
+            size = f" by less than {spot.least:.1f} m" if spot.least < MOST_SHIFT_M else ""
+            how = f"moved{size} along ({along})"
         lines.append(
             f"these sounds cannot show whether {names} is {how}; clap at places that you know, and run livessl "
             "calibrate verify"
