@@ -27,6 +27,14 @@ MOST_OFF_S: Final = 3600.0
 """Largest distance, in seconds, between the event and a frame of its clip; the fusion steps through all frame indices
 between, so that one damaged index would never end."""
 
+_SPEEDS_M_S: Final = (100.0, 2000.0)
+_RATES_HZ: Final = (100.0, 1e6)
+_MOST_M: Final = 1000.0
+_MOST_UNCERTAINTY: Final = 100.0
+"""Limits of the speed of sound, the sampling rate, the coordinates of microphones, and of what they may be off by, as a
+site file has them or wider. Correlations are as long as the way across an array takes: a damaged number would make them
+fill the memory."""
+
 _UNREADABLE: Final = (AttributeError, KeyError, OverflowError, TypeError, ValueError)
 """Errors that reading a `clip.json` of another form raises."""
 
@@ -216,7 +224,7 @@ def _parsed(about: Mapping[str, Any]) -> StoredSound:
         str(about["event_id"]),
         int(about["start_ns"]),
         _positive("duration_s", about["duration_s"]),
-        _positive("c_m_s", about["c_m_s"]),
+        _within("c_m_s", about["c_m_s"], _SPEEDS_M_S),
         _answer(about["answer"]),
         tuple(_array(str(name), known, files[name]) for name, known in arrays.items()),
     )
@@ -245,18 +253,18 @@ def _answer(answer: Mapping[str, Any]) -> Mapping[str, Any]:
 
 def _array(name: str, known: Mapping[str, Any], file: str) -> StoredArray:
     microphones_m = np.array(known["microphones_m"], dtype=np.float64)
-    if microphones_m.shape[1:] != (3,) or not np.isfinite(microphones_m).all():
+    if microphones_m.shape[1:] != (3,) or not (np.abs(microphones_m) <= _MOST_M).all():
         raise ValueError(f"arrays.{name}.microphones_m: expected positions (K, 3), got {known['microphones_m']!r}")
     uncertainty = Uncertainty(**known["uncertainty"])
-    for value in known["uncertainty"].values():
-        float(value)
+    for what, value in known["uncertainty"].items():
+        _within(f"arrays.{name}.uncertainty.{what}", value, (0.0, _MOST_UNCERTAINTY))
     return StoredArray(
         name,
         file,
         microphones_m,
         uncertainty,
         int(known["time_ns"]),
-        _positive(f"arrays.{name}.sample_rate_hz", known["sample_rate_hz"]),
+        _within(f"arrays.{name}.sample_rate_hz", known["sample_rate_hz"], _RATES_HZ),
         tuple(_row(name, row) for row in known["frames"]),
     )
 
@@ -267,6 +275,13 @@ def _row(name: str, row: Sequence[Any]) -> CutFrame:
     if found.begin < 0 or found.length <= 0:
         raise ValueError(f"arrays.{name}.frames: expected a begin of 0 or more and a length above 0, got {row!r}")
     return found
+
+
+def _within(what: str, value: Any, limits: tuple[float, float]) -> float:
+    low, high = limits
+    if not isinstance(value, int | float) or not low <= value <= high:
+        raise ValueError(f"{what}: expected a number from {low:g} to {high:g}, got {value!r}")
+    return float(value)
 
 
 def _positive(what: str, value: Any) -> float:
