@@ -191,8 +191,9 @@ def test_a_connection_that_died_silently_is_left(tmp_path: Path) -> None:
             return
 
     desk = SiteDesk(hub_site(tmp_path, "lab", ["nats://127.0.0.1:1"]))
-    desk.link.take_alerts([{"kind": "alert", "key": f"a{n}", "raised_utc": "2026-01-01T00:00:00Z"} for n in range(2)])
-    desk.link.take_alerts([])
+    alerts = [{"kind": "alert", "key": f"a{n}", "raised_utc": "2026-01-01T00:00:00Z"} for n in range(2)]
+    desk.link.messages.take_alerts(alerts)
+    desk.link.messages.take_alerts([])
     assert [each.kind for each in desk.outbox.unsent(10)] == ["alert", "alert"]
     dead: Any = Dead()
     asyncio.run(asyncio.wait_for(desk.link._send_all(dead, asyncio.Event()), 60))

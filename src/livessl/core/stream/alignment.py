@@ -1,7 +1,7 @@
 """Aligns the frames of all arrays on one frame index, and decides which are late for early results. It reads no clock.
 
 A frame index closes when every array that is awaited has reached it, or at its deadline. A frame that comes later is
-counted as late. Early results that were already computed do not include it; the final pass (`final_pass`) does. An
+counted as late. Early results that were already computed do not include it; the final pass (`final_input`) does. An
 array is awaited while it sends, keeps up, and is not excluded.
 """
 

@@ -137,6 +137,13 @@ class SiteState:
             self._set_up = self._following[-1][1]
             self._following.clear()
 
+    def start_over(self) -> None:
+        """Forget what was learned of the arrays, because the server's clock was set back."""
+        self.use_newest()
+        self.cache.clear()
+        self.votes.clear()
+        self.channel_faults.clear()
+
     def prepare(self, array: str, sample_rate_hz: float) -> None:
         """Compute what an array's sound will need, with every set-up that is to be used."""
         for set_up in (self._set_up, *(following for _, following in self._following)):
