@@ -104,7 +104,7 @@ class Server:
             url = url_of(self._listener, tls=certificate is not None)
             # milliseconds since the epoch: fewer than one message per millisecond is published, so none is used again
             fanout = Fanout(clock.now_ns() // 1_000_000)
-            outlets = Outlets(store, sinks, fanout, self._publish, on_event)
+            outlets = Outlets(store, sinks, fanout, self.publish, on_event)
             self.parts = assemble(site, clock, outlets, receiver, url, read, links)
             undo.pop_all()
         self.uvicorn = uvicorn_server(create_app(self.parts, self._access), certificate)
@@ -149,6 +149,17 @@ class Server:
     def stop(self) -> None:
         """End `run`; from any thread."""
         self.uvicorn.should_exit = True
+
+    def publish(self, message: JsonObject) -> None:
+        """Hand a message to subscribers; from any thread."""
+        published_ns = self._clock.monotonic_ns() if message.get("latency_stages_s") else None
+        loop = self.loop
+        if loop is None:
+            return
+        try:
+            loop.call_soon_threadsafe(self.parts.fanout.publish, message, published_ns)
+        except RuntimeError:  # the loop has just closed, and no subscriber is left
+            _log.debug("a message was published after the event loop had closed")
 
     def wait_idle(self) -> None:
         """Return when the running replay has ended and its last event is published."""
@@ -206,17 +217,6 @@ class Server:
         """End the request that waits for an event to be located again; a thread that waited on would hold the exit."""
         if self.parts.relocator is not None:
             self.parts.relocator.stop()
-
-    def _publish(self, message: JsonObject) -> None:
-        """Hand a message to subscribers; on the fusion thread."""
-        published_ns = self._clock.monotonic_ns() if message.get("latency_stages_s") else None
-        loop = self.loop
-        if loop is None:
-            return
-        try:
-            loop.call_soon_threadsafe(self.parts.fanout.publish, message, published_ns)
-        except RuntimeError:  # the loop has just closed, and no subscriber is left
-            _log.debug("a message was published after the event loop had closed")
 
 
 def _usable(site: Site, method: str | None) -> Site:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import orjson
-from sqlalchemy import func, select
+from sqlalchemy import select
 
 from livessl.server.forwarding import tables as forwarding
 from livessl.server.forwarding.outbox import Outbox
@@ -303,7 +303,7 @@ class Store:
 
     def _count_all(self) -> None:
         with self._database.reading() as connection:
-            count = int(connection.execute(select(func.count()).select_from(events)).scalar_one())
+            count = records.count_events(connection)
         with self._counting:
             self._count = count
 
