@@ -200,7 +200,7 @@ class Server:
                 raise error
 
     def _stop_on_error(self, task: asyncio.Task[None]) -> None:
-        """Stop if a task has failed: what it did would be missed, and nobody would know."""
+        """Stop if a task has failed: a server without it would look alive and do a part of its work only."""
         if not task.cancelled() and task.exception() is not None:
             self.stop()
 

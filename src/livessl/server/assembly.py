@@ -50,7 +50,7 @@ from livessl.traces import traces_in_use
 
 @dataclass(frozen=True, slots=True)
 class Outlets:
-    """Where the results of a server go.
+    """Destinations of a server's results.
 
     Parameters
     ----------

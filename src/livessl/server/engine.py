@@ -107,7 +107,7 @@ class Engine:
 
     @property
     def has_turned(self) -> bool:
-        """Whether the thread has taken its first turn: what computes is loaded by then."""
+        """True once the thread has taken its first turn: the modules that compute are loaded by then."""
         return self.turns > 0
 
     @property

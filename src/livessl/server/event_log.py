@@ -38,7 +38,7 @@ class Watcher(Protocol):
 
 
 class Answer(NamedTuple):
-    """What an event reports, rounded as it is published. A final event with the same answer is not published again."""
+    """Values of an event, rounded as they are published. A final event with the same values is not published again."""
 
     start_us: int
     duration_s: float

@@ -1,4 +1,4 @@
-"""What a site sends to the hub: of its messages for subscribers, those that the hub needs are put into the outbox."""
+"""Messages of a site for the hub: those messages for subscribers that the hub needs are put into the outbox."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a restarted server must know beside the events: how far the final pass came, and which arrays are disabled."""
+"""State that a restarted server needs beside the events: how far the final pass came, and the disabled arrays."""
 
 from __future__ import annotations
 
