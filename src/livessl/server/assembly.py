@@ -42,7 +42,7 @@ from livessl.server.tracks import Tracks
 from livessl.server.trails import Trails
 from livessl.server.zones.book import ZoneBook
 from livessl.server.zones.presence import Presence
-from livessl.server.zones.shapes import ZoneMap
+from livessl.server.zones.zone_map import ZoneMap
 from livessl.site.floor_plan import read_floor_plan
 from livessl.site.models import Site
 from livessl.traces import traces_in_use
