@@ -102,6 +102,7 @@ class ServedClips:
         self.server = server
         self.folder = folder
         self.tokens = tokens
+        self.client = httpx.Client(base_url=f"{server.url}/api/v1/", timeout=100)  # making one takes long
 
     @property
     def clips(self) -> Clips:
@@ -112,7 +113,7 @@ class ServedClips:
 
     def ask(self, path: str, method: str = "GET", role: str = "operator", **more: Any) -> httpx.Response:
         headers = {"Authorization": f"Bearer {self.tokens[role]}", **more.pop("headers", {})}
-        return httpx.request(method, f"{self.server.url}/api/v1/{path}", headers=headers, timeout=100, **more)
+        return self.client.request(method, path, headers=headers, **more)
 
     def get(self, path: str, role: str = "operator", **query: Any) -> dict[str, Any]:
         return self._answer(self.ask(path, role=role, params=query))
@@ -147,4 +148,5 @@ def served_clips(directory: Path, **clips: Any) -> Iterator[ServedClips]:
         served = ServedClips(server, directory / "clips", tokens)
         capture_scene(server)
         wait_until(lambda: served.clips.counts.written == 2, "both clips")
-        yield served
+        with served.client:
+            yield served

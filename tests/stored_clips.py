@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import cache
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from clip_desk import ClipDesk
 from livessl.clock import UnpacedClock
@@ -17,7 +17,7 @@ from livessl.site.build.fusion import make_fusion
 from livessl.site.models import Site
 from small_site import scene_recordings, site_of
 
-CLIPS: Final = {"folder": "clips", "pre_s": 1.0, "post_s": 0.5, "enhanced": False}
+CLIPS: Final[dict[str, Any]] = {"folder": "clips", "pre_s": 1.0, "post_s": 0.5, "enhanced": False}
 START_NS = 1_767_225_600_000_000_000
 
 
