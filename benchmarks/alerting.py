@@ -6,8 +6,8 @@
 A round is `livessl bench --live` without anything and with everything, one after the other, in an order that changes
 from round to round. With everything, each located event is stored in SQLite, alerts over a real Mosquitto, and has its
 clip cut and enhanced. The ratios are those of the two runs of a round, which the machine slows down alike. The output
-is one JSON object; the exit status is 1 if an alert or a clip failed, or if the median ratio of the latency, at 50 or
-95 %, is above `--most`.
+is one JSON object; the exit status is 1 if an alert or a clip failed, if the median ratio of the latency, at 50 or
+95 %, is above `--most`, or if a run dropped or shed sound, because then the two did not do the same work.
 """
 
 from __future__ import annotations
@@ -156,6 +156,13 @@ def faults(found: JsonObject, most: float) -> list[str]:
             said.append(f"alerts: expected deliveries and nothing else, got {run['alerts']}")
         if run["clips"]["failed"] or not run["clips"]["written"]:
             said.append(f"clips: expected some and no failure, got {run['clips']}")
+    busy = {kind: sum(not run["nothing_dropped"] for run in found[kind]) for kind in ("without", "with")}
+    said += [
+        f"{count} of {len(found[kind])} runs {kind} dropped or shed sound: expected a machine that carries the load; "
+        "stop what else runs on it, or lower --arrays"
+        for kind, count in busy.items()
+        if count
+    ]
     for name in JUDGED:
         ratio = found["compared"][f"latency {name}"]["ratio"]
         if ratio > most:

@@ -43,6 +43,7 @@ def test_ratio_of_a_round_takes_out_how_fast_the_machine_was(
 def report(**changes: Any) -> dict[str, Any]:
     """What was measured in one round, with changes of the run with everything."""
     run = {"latency_ms": dict.fromkeys(alerting.PERCENTILES, 10.0), "cpu_percent": 20.0, "rss_mb": 200}
+    run["nothing_dropped"] = True
     done = {"alerts": {"delivered": 9, "waiting": 1}, "clips": {"written": 8, "waiting": 1, "shed": 0, "failed": 0}}
     with_all = run | done | changes
     return {
@@ -62,6 +63,7 @@ def report(**changes: Any) -> dict[str, Any]:
         ({"alerts": {}}, ["alerts: expected deliveries and nothing else"]),
         ({"clips": {"written": 8, "failed": 1}}, ["clips: expected some and no failure"]),
         ({"latency_ms": {"p50": 11.5, "p95": 10.0, "p99": 90.0}}, ["latency p50: expected at most 1.1 times"]),
+        ({"nothing_dropped": False}, ["1 of 1 runs with dropped or shed sound"]),
     ],
 )
 def test_what_is_lost_or_slower_is_a_fault(changes: dict[str, Any], said: list[str]) -> None:
