@@ -12,8 +12,12 @@ from typing import Any, Final
 from urllib.parse import quote, urlencode
 
 from livessl.cli.output import complain
-from livessl.cli.server_answers import RefusedError, ask, order
+from livessl.cli.server_answers import RefusedError, ask_for, order
 from livessl.clock import utc_text
+from livessl.schema.answers import EventPage, Site
+from livessl.schema.relocation import Relocated
+from livessl.schema.values import Event
+from livessl.server.api.clip_schema import EventClips
 
 ANSWER_S: Final = 600.0
 """Longest wait, in seconds, for a server that locates an event: sounds of a minute take long beside live ones."""
@@ -24,8 +28,11 @@ PAGE: Final = 200
 OF_ONE_EVENT: Final = (404, 409, 503)
 """Statuses of answers that are about one event; after others, the next event would be refused as well."""
 
-DECISIVE: Final = ("site", "version", "room", "grid", "speed_of_sound_m_s", "band_hz", "activity", "arrays", "joint")
+DECISIVE: Final = {"site", "version", "room", "grid", "speed_of_sound_m_s", "band_hz", "activity", "arrays", "joint"}
 """What of `GET site` decides the answers."""
+
+ANSWERED: Final = {"moved_arrays", "stored", "again", "other_sources", "distance_m"}
+"""What of the answer to `POST relocate` is passed on."""
 
 JsonObject = dict[str, Any]
 
@@ -58,16 +65,15 @@ class ServerArchive:
     @cached_property
     def digest(self) -> str:
         """Digest of method, set-up, and what the server says of its site and release."""
-        site = ask(self.url, "site", self.token_file)
-        decisive = [self.method, self.set_up, *(site.get(name) for name in DECISIVE)]
-        return hashlib.sha256(json.dumps(decisive, sort_keys=True).encode()).hexdigest()[:16]
+        site = ask_for(Site, self.url, "site", self.token_file).model_dump(mode="json", include=DECISIVE)
+        return hashlib.sha256(json.dumps([self.method, self.set_up, site], sort_keys=True).encode()).hexdigest()[:16]
 
     def ids(self, since_ns: int | None, until_ns: int | None) -> list[str]:
         """Return the ids of the events that have recordings, oldest first; ask for each whether it has."""
         found, recorded = self._located(since_ns, until_ns), []
         for event_id in reversed(found):
-            state = ask(self.url, f"events/{quote(event_id)}/clips", self.token_file)["state"]
-            recorded += [] if state == "none" else [event_id]
+            clips = ask_for(EventClips, self.url, f"events/{quote(event_id)}/clips", self.token_file)
+            recorded += [] if clips.state == "none" else [event_id]
         if missing := len(found) - len(recorded):
             complain(f"{missing} of {len(found)} located events have no recordings and are left out", kind="note")
         return recorded
@@ -79,11 +85,11 @@ class ServerArchive:
         wanted |= {name: utc_text(time_ns) for name, time_ns in span.items() if time_ns is not None}
         found: list[str] = []
         while True:
-            page = ask(self.url, f"events?{urlencode(wanted)}", self.token_file)
-            found += [event["id"] for event in page["events"]]
-            if page["next_cursor"] is None:
+            page = ask_for(EventPage, self.url, f"events?{urlencode(wanted)}", self.token_file)
+            found += [event.id for event in page.events]
+            if page.next_cursor is None:
                 return found
-            wanted["cursor"] = page["next_cursor"]
+            wanted["cursor"] = page.next_cursor
 
     def relocate(self, event_ids: Sequence[str]) -> Iterator[JsonObject]:
         """Yield the answers, or why there is none, one event after the other.
@@ -114,12 +120,11 @@ class ServerArchive:
         wanted = {"method": self.method, "set_up": self.set_up}
         event = f"events/{quote(event_id)}"
         try:
-            found["time_utc"] = ask(self.url, event, self.token_file)["time_utc"]
-            answer = order(self.url, f"{event}/relocate", self.token_file, wanted, ANSWER_S)
+            about = ask_for(Event, self.url, event, self.token_file)
+            found |= about.model_dump(mode="json", include={"time_utc"})
+            answer = order(Relocated, self.url, f"{event}/relocate", self.token_file, wanted, ANSWER_S)
         except RefusedError as error:
             if error.status not in OF_ONE_EVENT:
                 raise
             return found | {"error": error.reason or str(error)}
-        return found | {
-            name: answer[name] for name in ("moved_arrays", "stored", "again", "other_sources", "distance_m")
-        }
+        return found | answer.model_dump(mode="json", include=ANSWERED)

@@ -115,6 +115,21 @@ def test_restart_finds_the_clips_and_deletes_what_is_unfinished(tmp_path: Path) 
     assert on_disk(tmp_path) == {"lab-1/a.flac", "lab-1/clip.json", "lab-2/a.flac", "lab-2/clip.json", "notes.txt"}
 
 
+@pytest.mark.parametrize(
+    "changes",
+    [{"files": ...}, {"files": None}, {"files": ["a"]}, {"files": [{"name": "a.txt", "bytes": 1}]}, {"start_ns": "x"},
+     {"files": [{"name": "a.flac", "bytes": None}]}, {"keep": ...}, {"keep": "no"}, {"position_m": 3}],
+)  # fmt: skip
+def test_clip_that_another_program_has_changed_is_unreadable(tmp_path: Path, changes: dict[str, Any]) -> None:
+    folder = ClipFolder(tmp_path)
+    folder.put("lab-1", write(5))
+    path = tmp_path / "lab-1" / "clip.json"
+    about = {**json.loads(path.read_text()), **changes}
+    path.write_text(json.dumps({name: value for name, value in about.items() if value is not ...}))
+    with pytest.raises(UnreadableClipError, match=rf"got another one: .*{next(iter(changes))}"):
+        folder.read("lab-1")
+
+
 def broken(*names: str) -> Any:
     """Stands in for `shutil.rmtree`: some folders cannot be deleted."""
 
