@@ -1,4 +1,4 @@
-"""What alerts, MQTT, clips and the history cost the live path: the service with and without them, in turn.
+"""The cost of alerts, MQTT, clips and the history on the live path: the service runs with and without them, in turn.
 
     python benchmarks/alerting.py --arrays 4 --clients 20 --seconds 20 --rounds 5     # two minutes a round
     python benchmarks/alerting.py --write                                             # the table in docs/alerts.md
@@ -62,7 +62,7 @@ class Service:
         self._port = port
         self._address = ""
         self.done: JsonObject = {}
-        """What the last server did: its deliveries by state, and its clips by outcome."""
+        """Deliveries of the last server by state, and its clips by outcome."""
 
     def start(self, site_file: Path) -> Any:
         """Start a server with a site file, to which the settings are added."""

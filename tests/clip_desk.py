@@ -1,4 +1,4 @@
-"""What tests of recordings work at: clips without a server, a server that stores them, and what a clip says."""
+"""Desks for tests of recordings: clips without a server, a server that stores them, and the content of a clip."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ ROLES: Final[tuple[Literal["viewer", "operator"], ...]] = ("viewer", "operator")
 
 
 def head(start_ns: int, sizes: Mapping[str, int]) -> dict[str, Any]:
-    """What every clip says, with recordings of these sizes in bytes; an enhanced one has that name."""
+    """The head of a clip with recordings of these sizes in bytes; an enhanced one has that name."""
     shared = {"sample_rate_hz": 16000, "duration_s": 1.5, "time_utc": utc_text(start_ns), "beams": []}
     shared |= {"pre_roll_s": 1.0, "post_roll_s": 0.5, "gaps_s": [[0.1, 0.2]], "gain_db": 12.0}
     files = []

@@ -103,7 +103,7 @@ class Archive(Protocol):
 
     @property
     def place(self) -> str:
-        """Where it is."""
+        """The folder or the address."""
         ...
 
     def ids(self, since_ns: int | None, until_ns: int | None) -> list[str]:

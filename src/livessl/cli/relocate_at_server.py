@@ -29,10 +29,10 @@ OF_ONE_EVENT: Final = (404, 409, 503)
 """Statuses of answers that are about one event; after others, the next event would be refused as well."""
 
 DECISIVE: Final = {"site", "version", "room", "grid", "speed_of_sound_m_s", "band_hz", "activity", "arrays", "joint"}
-"""What of `GET site` decides the answers."""
+"""Fields of `GET site` that decide the answers."""
 
 ANSWERED: Final = {"moved_arrays", "stored", "again", "other_sources", "distance_m"}
-"""What of the answer to `POST relocate` is passed on."""
+"""Fields of the answer to `POST relocate` that are passed on."""
 
 JsonObject = dict[str, Any]
 

@@ -59,7 +59,7 @@ class ClipFile(Model):
 
 
 class ClipHead(Model):
-    """What every reader of `clip.json` needs; only locating the event again needs more."""
+    """The part of `clip.json` that every reader needs; only locating the event again needs more."""
 
     model_config = ConfigDict(strict=True)
 

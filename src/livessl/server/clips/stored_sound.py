@@ -79,7 +79,7 @@ class StoredArray:
 
 @dataclass(frozen=True, slots=True)
 class StoredSound:
-    """What a clip says of an event's sound.
+    """The sound of an event, as its clip describes it.
 
     Parameters
     ----------
