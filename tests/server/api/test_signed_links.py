@@ -15,6 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from alert_desk import PATIENT, after, alert_site, encoded, sound
+from clip_desk import recordings
 from livessl.clock import UnpacedClock, utc_ns
 from livessl.core.stream.final_pass import FinalResults
 from livessl.schema.alerts import OpenLinks
@@ -66,9 +67,7 @@ class Desk:
         return self.alerted(event.id)
 
 
-def _recording(folder: Path) -> JsonObject:
-    (folder / "enhanced.flac").write_bytes(SOUND)
-    return {"start_ns": NOW_NS, "files": [{"name": "enhanced.flac", "bytes": len(SOUND)}]}
+_recording = recordings(NOW_NS, {"enhanced.flac": SOUND})
 
 
 @contextmanager
@@ -141,7 +140,7 @@ def test_link_opens_its_path_only_and_only_for_reading(desk: Desk) -> None:
         assert desk.status(links["clip"], method) == 401, method
     clips = desk.server.parts.clips
     assert clips is not None
-    assert clips.folder.about("small-2") is not None
+    assert clips.folder.read("small-2") is not None
 
 
 def test_changed_link_is_refused_and_a_token_still_works_with_it(desk: Desk) -> None:
