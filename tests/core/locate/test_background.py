@@ -120,3 +120,42 @@ def test_no_frame_is_loud_beside_a_weak_or_unknown_background() -> None:
     assert not loud_frames(weighing([0.01 * FAR_BELOW] * 8 + powers, 8))
     assert not loud_frames(weighing(powers, 0))
     assert not loud_frames(replace(weighing([0.2] * 8 + powers, 8), course=None))
+
+
+def doubtful(seed: int, *, noise: float, looks: bool) -> Localization:
+    """Locate a burst of two frames in noise of this root mean square, 48 frames long; that of the burst is 0.03."""
+    rng = np.random.default_rng(seed)
+    frames = QUIET + 3 * ACTIVE
+    own = np.zeros(frames * FRAME)
+    sounding = slice(QUIET * FRAME, (QUIET + 2) * FRAME)
+    own[sounding] = burst(2 * FRAME, seed + 1)
+    own *= 0.03 / np.sqrt(np.square(own[sounding]).mean())
+    estimator, sounds = Onset(ARRAYS, GRID, C_M_S), {}
+    for spec in ARRAYS:
+        clean = heard(spec, SOURCE_M, own)
+        samples: Float32Array = clean + np.float32(noise) * rng.standard_normal(clean.shape, dtype=np.float32)
+        parts = np.split(samples, frames, axis=1)
+        listener = estimator.onset_front_end(spec.name, RATE_HZ)
+        onsets = [listener.push(part, quiet=k < QUIET) for k, part in enumerate(parts)]
+        course = Course(np.arange(frames), np.array([float(np.square(part).mean()) for part in parts]), QUIET)
+        active = samples[:, QUIET * FRAME :]
+        sounds[spec.name] = Sound((active,), RATE_HZ, onsets, course=course, second_looks=looks)
+    return estimator.locate(sounds)
+
+
+def test_a_doubtful_sound_in_noise_is_found_by_its_loud_frames() -> None:
+    without, found = (doubtful(2, noise=0.08, looks=looks) for looks in (False, True))
+    assert without.refused is not None
+    assert apart_m(without, SOURCE_M) > 1.0
+    assert found.refused is None
+    assert apart_m(found, SOURCE_M) < 0.2
+    assert found.features is not None
+    assert not found.features.whole  # loud frames, not whole segments
+
+
+@given(seed=st.integers(1, 100), noise=st.floats(0.04, 0.1))
+@settings(max_examples=3, deadline=None)
+def test_another_look_never_makes_a_sound_less_certain(seed: int, noise: float) -> None:
+    without, found = (doubtful(seed, noise=noise, looks=looks) for looks in (False, True))
+    assert found.refused is None or without.refused is not None
+    assert found.confidence >= without.confidence or without.refused is not None
