@@ -49,9 +49,10 @@ class Contact(NamedTuple):
         return int(self.report.get("waiting", 0))
 
     @property
-    def states(self) -> dict[str, str]:
+    def states(self) -> Mapping[str, str]:
         """State of each array by name at the last report, which names all of them; empty before the first one."""
-        return dict(self.report.get("arrays", {}))
+        states: Mapping[str, str] = self.report.get("arrays", {})
+        return states
 
 
 def describe(contact: Contact, states: Mapping[str, str]) -> JsonObject:
