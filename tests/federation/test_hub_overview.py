@@ -10,15 +10,12 @@ import orjson
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from prometheus_client import CollectorRegistry, generate_latest
-from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
-from prometheus_client.registry import Collector
 from sqlalchemy import Connection, create_engine, select
 
 from history_places import Place as DatabasePlace
 from livessl.clock import SystemClock, utc_text
 from livessl.federation.archive import Archive
-from livessl.federation.metrics import sites_text
+from livessl.federation.metrics import site_metrics
 from livessl.federation.overview import AWAY_S, Contact, describe
 from livessl.federation.storing import Delivery, put
 from livessl.server.api.encode import JsonObject
@@ -82,44 +79,14 @@ def test_a_site_is_away_after_some_silence(age_s: float, status: str) -> None:
     contact = Contact("lab", age_s, START_NS, 3, 0, {"waiting": 4, "version": "9"})
     found = describe(contact, {"north": "healthy", "south": "disabled"})
     assert (found["status"], found["age_s"], found["newest_event_utc"]) == (status, age_s, None)
-    assert f'livessl_site_up{{site="lab"}} {float(status == "ok")}\n' in sites_text([contact])
-
-
-contacts = st.builds(
-    Contact,
-    site=st.text("aé\\\"\n{}=", max_size=6),
-    age_s=st.floats(0, 1e7),
-    contact_ns=st.just(START_NS),
-    missing=st.integers(0, 2**53),
-    newest_ns=st.just(0),
-    report=st.fixed_dictionaries({"waiting": st.integers(0, 10**7)}),
-)
-
-
-class FromLibrary(Collector):
-    """The metrics of sites as the library's own families."""
-
-    def __init__(self, given_contacts: Sequence[Contact]) -> None:
-        self._contacts = given_contacts
-
-    def collect(self) -> Iterator[Metric]:
-        up = GaugeMetricFamily("livessl_site_up", "1 unless the site is away.", labels=["site"])
-        age = GaugeMetricFamily("livessl_site_age_seconds", "Seconds since the site's last contact.", labels=["site"])
-        waiting = GaugeMetricFamily("livessl_site_waiting", "Messages that waited at the site.", labels=["site"])
-        missing = CounterMetricFamily("livessl_site_missing", "Messages that never came.", labels=["site"])
-        for each in self._contacts:
-            up.add_metric([each.site], float(not each.is_away))
-            age.add_metric([each.site], round(each.age_s, 3))
-            waiting.add_metric([each.site], each.report["waiting"])
-            missing.add_metric([each.site], each.missing)
-        yield from (up, age, waiting, missing)
-
-
-@given(st.lists(contacts, max_size=4))
-def test_metrics_are_written_as_the_library_writes_them(listed: list[Contact]) -> None:
-    registry = CollectorRegistry()
-    registry.register(FromLibrary(listed))
-    assert sites_text(listed) == generate_latest(registry).decode()
+    metrics = {metric.name: [(one.labels, one.value) for one in metric.samples] for metric in site_metrics([contact])}
+    lab = {"site": "lab"}
+    assert metrics == {
+        "livessl_site_up": [(lab, float(status == "ok"))],
+        "livessl_site_age_seconds": [(lab, round(age_s, 3))],
+        "livessl_site_waiting": [(lab, 4)],
+        "livessl_site_missing": [(lab, 3)],
+    }
 
 
 # --- batches

@@ -40,6 +40,14 @@ def recording(seconds: float = 1.0, rate_hz: float = RATE_HZ, channels: int = 4,
     return MemoryRecording("hiss", float(rate_hz), samples)
 
 
+@pytest.mark.parametrize("rate_hz", [1, 24, 26])
+def test_file_with_a_rate_of_a_few_hertz_is_read_in_blocks(tmp_path: Path, rate_hz: int) -> None:
+    samples = hiss(0.01)
+    path = write_wav(tmp_path / "slow.wav", samples, rate_hz)
+    for read in (FileRecording(path), MemoryRecording("slow", float(rate_hz), samples)):
+        assert_array_equal(joined(read.blocks(START_NS)), samples)
+
+
 @pytest.mark.parametrize(
     ("ending", "subtype", "rounding"),
     [

@@ -28,22 +28,22 @@ def add_arguments(parser: Any) -> None:
     add = parser.add_argument
     add("clips", type=Path, nargs="?", help="folder of clips (default: that of server.clips in the site file)")
     add_site(parser)
-    add_method(parser)
+    add_method(parser, "that by which each event was located")
     add_joint(parser)
     add(
         "--set-up",
         choices=("then", "now"),
         default="then",
-        help="poses and speed of sound: those by which each event was located, or those of the site file with its "
+        help="poses and speed of sound; then: as when each event was located, now: as in the site file with its "
         "calibration (default: then)",
     )
-    add("--since", type=argument.time, metavar="TIME", help="only events that began then or later (RFC 3339)")
-    add("--until", type=argument.time, metavar="TIME", help="only events that began then or earlier (RFC 3339)")
+    add("--since", type=argument.time, metavar="TIME", help="only events that began at TIME or later (RFC 3339)")
+    add("--until", type=argument.time, metavar="TIME", help="only events that began at TIME or earlier (RFC 3339)")
     add(
         "--out",
         type=Path,
         metavar="FILE",
-        help="append the answers to FILE, one JSON object a line, and leave out the events that it has located already",
+        help="append the answers to FILE, one JSON object a line, and skip the events that FILE already answers",
     )
     add("--jobs", type=argument.positive, default=len(os.sched_getaffinity(0)), help="processes (default: all cores)")
     add_json(parser)
@@ -51,14 +51,22 @@ def add_arguments(parser: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
-    from livessl.server.clips.folder import ClipReader
+    from livessl.core.methods import is_import_path
+    from livessl.server.clips.folder import ClipReader, ClipsError
     from livessl.server.clips.relocate_many import Task, relocate_many
+    from livessl.site.build.fusion import make_estimator
 
     import_from_here()
     site = read_site(arguments)
+    if arguments.method is not None and is_import_path(arguments.method):
+        make_estimator(site, arguments.method)  # one error before all, instead of one for each event
     folder = _folder(arguments.clips, site)
     task, clips = Task(site, folder, arguments.method, arguments.set_up), ClipReader(folder)
-    wanted = [name for name in clips.ids() if _is_in_span(clips, name, arguments)]
+    try:
+        ids = clips.ids()
+    except ClipsError as error:
+        raise UseError(str(error)) from error
+    wanted = [name for name in ids if _is_in_span(clips, name, arguments)]
     if not wanted:
         complain(f"{folder}: no event of that span has recordings", kind="note")
     distances_m: list[float] = []
@@ -110,33 +118,49 @@ def _answers(path: Path | None, task: Task, wanted: Sequence[str]) -> Iterator[t
     Raises
     ------
     UseError
-        If it has answers of another method, set-up or calibration, or something else.
+        If it has answers of another method, set-up or calibration, or something else, or cannot be read or written.
     """
     if path is None:
         yield set(), lambda _: None
         return
-    known: set[str] = set()
-    kept: list[bytes] = []
-    if path.exists():
-        again = set(wanted)
-        for line in path.read_bytes().splitlines(keepends=True):
-            if not line.endswith(b"\n"):  # a command that was killed has left it; it is written again
-                break
-            event_id, is_located = _held(path, line, task)
-            if is_located:
-                known.add(event_id)
-            if is_located or event_id not in again:
-                kept.append(line)
-        fresh = path.with_name(f"{path.name}.partial")
-        fresh.write_bytes(b"".join(kept))
-        fresh.replace(path)
-    with path.open("ab") as file:
+    try:
+        known = _sorted_out(path, task, frozenset(wanted)) if path.exists() else set()
+        opened = path.open("ab")
+    except OSError as error:
+        raise UseError(f"--out {path}: expected a file that can be written: {error.strerror or error}") from error
+    with opened as file:
 
         def keep(found: dict[str, Any]) -> None:
             file.write(json.dumps(found).encode() + b"\n")
             file.flush()
 
         yield known, keep
+
+
+def _sorted_out(path: Path, task: Task, wanted: frozenset[str]) -> set[str]:
+    """Remove what a file of answers says of wanted events that could not be located; return the ids of those that were.
+
+    Raises
+    ------
+    UseError
+        See `_answers`.
+    OSError
+        If the file cannot be read or written.
+    """
+    known: set[str] = set()
+    kept: list[bytes] = []
+    for line in path.read_bytes().splitlines(keepends=True):
+        if not line.endswith(b"\n"):  # a command that was killed has left it; it is written again
+            break
+        event_id, is_located = _held(path, line, task)
+        if is_located:
+            known.add(event_id)
+        if is_located or event_id not in wanted:
+            kept.append(line)
+    fresh = path.with_name(f"{path.name}.partial")
+    fresh.write_bytes(b"".join(kept))
+    fresh.replace(path)
+    return known
 
 
 def _held(path: Path, line: bytes, task: Task) -> tuple[str, bool]:
@@ -151,7 +175,7 @@ def _held(path: Path, line: bytes, task: Task) -> tuple[str, bool]:
         found = json.loads(line)
         event_id, method, set_up, digest = (found[name] for name in ("event_id", "method", "set_up", "digest"))
         is_located = found["again"] is not None
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise UseError(f"--out: expected answers of `livessl relocate` in {path}, got another file") from error
     if (method, set_up) != (task.method, task.set_up):
         raise UseError(f"--out: {path} has answers of --method {method} --set-up {set_up}; name another file")

@@ -7,10 +7,15 @@ import urllib.error
 import urllib.request
 from http.client import HTTPException
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
-from livessl.client.address import open_url, redirection
+from livessl.client.address import check_url, open_url, redirection
 from livessl.errors import RunError, UseError
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
+
+M = TypeVar("M", bound="BaseModel")
 
 ANSWER_S: Final = 10.0
 """Longest wait for a server's answer, seconds."""
@@ -30,20 +35,43 @@ def read_token(token_file: Path) -> str:
     Raises
     ------
     UseError
-        If the file cannot be read.
+        If the file cannot be read, or holds no token.
     """
     try:
-        return token_file.read_text(encoding="utf-8").strip()
+        token = token_file.read_text(encoding="utf-8").strip()
     except OSError as error:
         raise UseError(f"--token-file: cannot read {token_file}: {error.strerror}") from error
     except UnicodeDecodeError as error:
         raise UseError(f"--token-file: expected a token in {token_file}, got bytes that are no text") from error
+    if not (token and token.isascii() and token.isprintable()):
+        raise UseError(f"--token-file: expected the line that `livessl keys token` printed in {token_file}, got another")
+    return token
 
 
 def ask(url: str, path: str, token_file: Path | None) -> Any:
-    """Return a server's answer to `GET /api/v1/PATH`, which is JSON: see `fetch`."""
+    """Return a server's answer to `GET /api/v1/PATH`, which is JSON: see `fetch`; any JSON will do."""
     address = _address(url, path)
-    return _decoded(address, fetch(address, token_file))
+    body = fetch(address, token_file)
+    try:
+        return json.loads(body)
+    except (ValueError, RecursionError) as error:
+        raise RunError(f"{address}: the answer is not JSON ({error}); check the address") from error
+
+
+def ask_for(model: type[M], url: str, path: str, token_file: Path | None) -> M:
+    """Return a server's answer to `GET /api/v1/PATH`.
+
+    Raises
+    ------
+    UseError
+        As `fetch`.
+    RunError
+        As `fetch`, and if the answer is not what `model` describes.
+    """
+    from livessl.client.reading import read_answer
+
+    address = _address(url, path)
+    return read_answer(model, fetch(address, token_file), address)
 
 
 def fetch(address: str, token_file: Path | None) -> bytes:
@@ -59,11 +87,15 @@ def fetch(address: str, token_file: Path | None) -> bytes:
     return _answer(address, token_file, None, ANSWER_S)
 
 
-def order(url: str, path: str, token_file: Path | None, value: Any, wait_s: float = ANSWER_S) -> Any:
-    """Return a server's answer, which is JSON, to `POST /api/v1/PATH` with a value as JSON.
+def order(
+    model: type[M], url: str, path: str, token_file: Path | None, value: Any, wait_s: float = ANSWER_S
+) -> M:
+    """Return a server's answer to `POST /api/v1/PATH` with a value as JSON.
 
     Parameters
     ----------
+    model : type
+        Model of the answer.
     url, path : str
     token_file : Path or None
         File that holds a token.
@@ -74,26 +106,28 @@ def order(url: str, path: str, token_file: Path | None, value: Any, wait_s: floa
     Raises
     ------
     UseError, RunError
-        See `fetch`.
+        See `ask_for`.
     """
+    from livessl.client.reading import read_answer
+
     address = _address(url, path)
-    return _decoded(address, _answer(address, token_file, json.dumps(value).encode(), wait_s))
+    return read_answer(model, _answer(address, token_file, json.dumps(value).encode(), wait_s), address)
+
+
+def check_address(url: str) -> None:
+    """Raise `UseError` unless --url names a server."""
+    try:
+        check_url(url)
+    except UseError as error:
+        raise UseError(f"--{error}") from error
 
 
 def _address(url: str, path: str) -> str:
+    check_address(url)
     return f"{url.rstrip('/')}/api/v1/{path}"
 
 
-def _decoded(address: str, body: bytes) -> Any:
-    try:
-        return json.loads(body)
-    except ValueError as error:
-        raise RunError(f"{address}: the answer is not JSON ({error}); check the address") from error
-
-
 def _answer(address: str, token_file: Path | None, body: bytes | None, wait_s: float) -> bytes:
-    if not address.startswith(("http://", "https://")):
-        raise UseError(f"--url: expected an address such as http://127.0.0.1:8000, got {address!r}")
     headers = {} if body is None else {"Content-Type": "application/json"}
     if token_file is not None:
         headers["Authorization"] = f"Bearer {read_token(token_file)}"

@@ -20,9 +20,9 @@ from livessl import __version__
 from livessl.cli.exits import OK
 from livessl.cli.options import add_json
 from livessl.cli.output import complain
-from livessl.cli.server_answers import add_server, ask, fetch
+from livessl.cli.server_answers import add_server, ask, check_address, fetch
 from livessl.clock import SystemClock, utc_text
-from livessl.errors import ConfigError, RunError
+from livessl.errors import ConfigError, RunError, UseError
 
 LINES: Final = 1000
 """Most lines of the server's log, and of the journal."""
@@ -55,7 +55,7 @@ class Bundle:
 
         try:
             text = make()
-        except (RunError, ConfigError, OSError, ValueError, subprocess.SubprocessError) as error:
+        except (RunError, UseError, OSError, ValueError, subprocess.SubprocessError) as error:
             self.missing[name] = scrubbed(str(error), self.secrets)
         else:
             self.parts[name] = scrubbed(text, self.secrets).encode()
@@ -71,6 +71,8 @@ def add_arguments(parser: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
+    if arguments.url is not None:
+        check_address(arguments.url)
     time_utc = utc_text(SystemClock().now_ns())
     stamp = time_utc.partition(".")[0].replace("-", "").replace(":", "")
     path = arguments.out or Path(f"livessl-support-{stamp}Z.zip")
@@ -100,10 +102,11 @@ def _add_site(bundle: Bundle, path: Path) -> Any:
     """Add the site file without secrets, and what `check` finds in it; return its data, None if it has none."""
     import yaml
 
+    from livessl.site.findings import read_yaml
     from livessl.site.redact import redacted
 
     try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+        data = read_yaml(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError) as error:
         bundle.missing["site.yaml"] = f"{path} cannot be read as YAML ({type(error).__name__}); run `livessl check`"
         data = None

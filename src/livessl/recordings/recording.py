@@ -93,7 +93,7 @@ class FileRecording:
         """Yield blocks of `BLOCK_S`, (channels, n) each; `start_ns` is the site time of the first sample."""
         with SoundFile(self._path) as file:
             yield from _blocks(
-                file.pieces(round(BLOCK_S * self.sample_rate_hz), self.frames), self.sample_rate_hz, start_ns
+                file.pieces(_block_length(self.sample_rate_hz), self.frames), self.sample_rate_hz, start_ns
             )
 
     def _check(self, file: SoundFile) -> None:
@@ -150,7 +150,7 @@ class MemoryRecording:
 
     def blocks(self, start_ns: int) -> Iterator[Block]:
         """Yield blocks of `BLOCK_S`, (channels, n) each; `start_ns` is the site time of the first sample."""
-        n = round(BLOCK_S * self.sample_rate_hz)
+        n = _block_length(self.sample_rate_hz)
         pieces = (self.samples[:, first : first + n].T for first in range(0, self.samples.shape[1], n))
         yield from _blocks(pieces, self.sample_rate_hz, start_ns)
 
@@ -311,6 +311,11 @@ class StackedRecording:
                     f"them only, {at_s:.3f} s after they begin; record them through one device"
                 )
             yield Block(first.first_index, np.concatenate([block.samples for block in blocks]), first.stamp_ns)
+
+
+def _block_length(rate_hz: float) -> int:
+    """Return the number of samples of a block; at a rate of a few hertz a block has one and lasts longer."""
+    return max(1, round(BLOCK_S * rate_hz))
 
 
 def _blocks(pieces: Iterable[Float32Array], rate_hz: float, start_ns: int) -> Iterator[Block]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 from pathlib import Path
@@ -111,6 +112,24 @@ def test_restart_finds_the_clips_and_deletes_what_is_unfinished(tmp_path: Path) 
     assert (again.count, again.kept, again.nbytes) == (2, 1, 2 * len(SOUND))
     assert (tmp_path / "foreign").is_dir()
     assert on_disk(tmp_path) == {"lab-1/a.flac", "lab-1/clip.json", "lab-2/a.flac", "lab-2/clip.json", "notes.txt"}
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"files": ...}, {"files": None}, {"files": ["a"]}, {"files": [{"name": "a.txt", "bytes": 1}]}, {"start_ns": "x"},
+     {"files": [{"name": "a.flac", "bytes": None}]}, {"keep": ...}, {"keep": "no"}, {"position_m": 3}],
+)  # fmt: skip
+def test_clip_that_another_program_has_changed_has_no_recordings(tmp_path: Path, changes: dict[str, Any]) -> None:
+    folder = ClipFolder(tmp_path)
+    folder.put("lab-1", write(5))
+    path = tmp_path / "lab-1" / "clip.json"
+    about = {**json.loads(path.read_text()), **changes}
+    path.write_text(json.dumps({name: value for name, value in about.items() if value is not ...}))
+    assert folder.complete("lab-1") is None
+    assert folder.file("lab-1", "a.flac") is None
+    assert not folder.keep("lab-1", True)
+    assert folder.delete("lab-1")
+    assert on_disk(tmp_path) == set()
 
 
 def broken(*names: str) -> Any:

@@ -205,6 +205,8 @@ DAMAGES: dict[str, tuple[str, Any, str]] = {
     "arrays of another form": ("arrays", ["north"], "has no attribute 'items'"),
     "no answer": ("answer", ..., "'answer' is missing"),
     "answer of another form": ("answer.position_m", [1.0], "not enough values"),
+    "answer in words": ("answer.confidence", "0.9", "a confidence and a position in numbers"),
+    "position in words": ("answer.position_m", ["1", "2", "3"], "a confidence and a position in numbers"),
 }
 
 

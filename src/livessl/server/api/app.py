@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Final
 
 from fastapi import Depends, FastAPI, Request, Response
+from fastapi.exceptions import RequestValidationError
 from fastapi.responses import FileResponse, JSONResponse
 from fastapi.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -30,7 +31,7 @@ from livessl.server.api.metrics import metrics_route
 from livessl.server.api.point_routes import point_route
 from livessl.server.api.proposal_routes import proposal_routes
 from livessl.server.api.proxy import BehindProxy
-from livessl.server.api.queries import refuse_unknown_parameters
+from livessl.server.api.queries import refuse_request, refuse_unknown_parameters
 from livessl.server.api.reload_routes import reload_route
 from livessl.server.api.relocate_routes import relocate_route
 from livessl.server.api.set_up_routes import set_up_routes
@@ -101,6 +102,7 @@ def create_app(parts: Parts, access: Access) -> FastAPI:
     documentation.add_documentation(app)
 
     app.add_exception_handler(StoreError, _without_database)
+    app.add_exception_handler(RequestValidationError, refuse_request)
 
     @app.get("/", include_in_schema=False)
     async def dashboard() -> FileResponse:

@@ -58,7 +58,7 @@ def clip_routes(parts: Parts) -> APIRouter:
     @router.get("/events/{event_id}/clips", response_model=clip_schema.EventClips)
     def get_event_clips(event_id: str) -> Response:
         """Recordings of an event."""
-        about = None if clips is None else clips.folder.about(event_id)
+        about = None if clips is None else clips.folder.complete(event_id)
         waits = clips is not None and clips.is_waiting(event_id)
         found = {
             "v": API_VERSION,

@@ -23,6 +23,9 @@ from livessl.errors import RunError
 ABOUT: Final = "clip.json"
 """File about a clip's recordings."""
 
+SUFFIXES: Final = (".flac", ".wav")
+"""Ends of the names of recordings."""
+
 PARTIAL: Final = ".partial-"
 """Beginning of the name of a folder that is being written or deleted."""
 
@@ -72,7 +75,7 @@ class ClipReader:
             raise ClipsError(f"{self._path}: expected a folder of clips: {error.strerror or error}; name it") from error
 
     def about(self, event_id: str) -> About | None:
-        """Return what is known of an event's clip; None if it has none."""
+        """Return what `clip.json` says of an event's clip, whatever that is; None if it has none."""
         if not _SAFE.fullmatch(event_id):
             return None
         try:
@@ -80,9 +83,14 @@ class ClipReader:
         except OSError:
             return None
 
+    def complete(self, event_id: str) -> About | None:
+        """Return what is known of an event's clip; None if it has none, or one that another program has changed."""
+        about = self.about(event_id)
+        return about if about is not None and _is_complete(about) else None
+
     def file(self, event_id: str, name: str) -> Path | None:
         """Return the path of one of a clip's recordings; None if there is none of that name."""
-        about = self.about(event_id)
+        about = self.complete(event_id)
         if about is None or name not in {each["name"] for each in about["files"]}:
             return None
         path = self._path / event_id / name
@@ -229,7 +237,7 @@ class ClipFolder(ClipReader):
             If the disk does not take it.
         """
         with self._lock:
-            about = self.about(event_id)
+            about = self.complete(event_id)
             if about is None:
                 return False
             path = self._path / event_id / ABOUT
@@ -339,6 +347,17 @@ def _parsed(data: bytes) -> About | None:
     except orjson.JSONDecodeError:
         return None
     return about if isinstance(about, dict) else None
+
+
+def _is_complete(about: About) -> bool:
+    """Return whether the file about a clip says what the server needs of it."""
+    try:
+        int(about["start_ns"])
+        names = [str(each["name"]) for each in about["files"] if int(each["bytes"]) >= 0]
+    except (KeyError, TypeError, ValueError, OverflowError):
+        return False
+    known = isinstance(about.get("keep"), bool) and isinstance(about.get("position_m"), list | None)
+    return known and all(Path(name).suffix in SUFFIXES for name in names)
 
 
 def _write_through(path: Path, data: bytes) -> None:

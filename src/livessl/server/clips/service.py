@@ -202,7 +202,7 @@ class Clips:
 
     def best_file(self, event_id: str) -> Path | None:
         """Return the recording that people listen to first: the enhanced one, or that of the first array."""
-        about = self.folder.about(event_id)
+        about = self.folder.complete(event_id)
         names = [] if about is None else [each["name"] for each in about["files"]]
         name = ENHANCED if ENHANCED in names else next(iter(names), None)
         return None if name is None else self.folder.file(event_id, name)

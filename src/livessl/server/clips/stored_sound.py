@@ -234,9 +234,12 @@ def _parsed(about: Mapping[str, Any]) -> StoredSound:
 def _answer(answer: Mapping[str, Any]) -> Mapping[str, Any]:
     if not isinstance(answer["method"], str) or not isinstance(answer["status"], str):
         raise TypeError(f"answer: expected a method and a status in words, got {answer!r}")
-    float(answer["confidence"])
-    if answer["position_m"] is not None:
-        _x, _y, _z = map(float, answer["position_m"])
+    position_m = answer["position_m"]
+    numbers = [answer["confidence"], *([] if position_m is None else position_m)]
+    if not all(isinstance(number, int | float) for number in numbers):
+        raise TypeError(f"answer: expected a confidence and a position in numbers, got {numbers!r}")
+    if position_m is not None:
+        _x, _y, _z = position_m
     return answer
 
 
