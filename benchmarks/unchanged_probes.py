@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -11,6 +12,7 @@ from typing import Final
 from unchanged_api import served
 from unchanged_trees import (
     MAX_ERROR_CHARACTERS,
+    Done,
     Pair,
     ProbeError,
     Tree,
@@ -22,6 +24,9 @@ from unchanged_trees import (
 )
 
 HERE: Final = Path(__file__).parent
+
+COMMANDS: Final = HERE / "unchanged_commands.py"
+"""Script that runs many commands in one process."""
 
 REASON: Final = re.compile(rb'"reason": "(?:[^"\\]|\\.)*"')
 """The reason of an event in JSON, with its text."""
@@ -177,17 +182,22 @@ BROKEN_SITES: Final = (
 """Wrong values, a misspelt key and a microphone outside the room, no YAML: only the exit codes are compared."""
 
 
-def check(pair: Pair, _: Options) -> Finding:
+def check(pair: Pair, _options: Options) -> Finding:
     """`livessl check --json` prints the same about every shipped site file."""
     outputs: list[dict[str, bytes]] = []
     for tree in pair.both():
-        said: dict[str, bytes] = {}
-        for name, path in tree.site_files().items():
-            said |= tree.livessl("check", "--json", path, folder=pair.folder).outputs(name)
+        files, asked = tree.site_files(), list[list[str]]()
+        asked += [["check", "--json", str(path)] for path in files.values()]
         for number, text in enumerate(BROKEN_SITES, start=1):
             path = pair.folder / f"broken-{number}.yaml"
             path.write_text(text, encoding="utf-8")
-            code = tree.livessl("check", path, folder=pair.folder).code
+            asked.append(["check", str(path)])
+        done = tree.must(tree.python(COMMANDS, json.dumps(asked), folder=pair.folder), "check site files")
+        answers = load_json(done.out, "check")
+        said: dict[str, bytes] = {}
+        for name, (code, out) in zip(files, answers, strict=False):
+            said |= Done(code, out.encode(), "").outputs(name)
+        for number, (code, _) in enumerate(answers[len(files) :], start=1):
             said[f"broken site {number}, exit code"] = str(code).encode()
         outputs.append(said)
     base, head = outputs
@@ -196,29 +206,19 @@ def check(pair: Pair, _: Options) -> Finding:
 
 
 def commands(pair: Pair, _: Options) -> Finding:
-    """Every command, option and choice that the help names is still there."""
-    base, head = (set(_described(tree, pair.folder)) for tree in pair.both())
+    """Every command, option and choice that the help names is still there, in commands below commands as well."""
+    outs = [tree.must(tree.python(COMMANDS, folder=pair.folder), "print all helps").out for tree in pair.both()]
+    base, head = (set(_named(load_json(out, "helps"))) for out in outs)
     return Finding(f"{len(base)} commands, options and choices", missing(base, head))
 
 
-def _described(tree: Tree, folder: Path, *command: str) -> Iterator[str]:
-    """Yield what the help of a command names, and that of the commands below it."""
-    text = tree.must(tree.livessl(*command, "--help", folder=folder), " ".join((*command, "--help"))).out.decode()
-    chosen = [word for choices in re.findall(r"\{([^}]+)\}", text) for word in choices.split(",")]
-    below = commands_of(text)
-    for word in {*below, *chosen, *re.findall(r"--[a-z][a-z0-9-]*", text)}:
-        yield " ".join((*command, word))
-    for name in below:
-        yield from _described(tree, folder, *command, name)
-
-
-def commands_of(text: str) -> list[str]:
-    """Return the commands that argparse's help lists: below a line with nothing but their name for all or their choice.
-
-    Choices of an option, such as `--log {text,json}`, are no commands.
-    """
-    lists = re.findall(r"^ {2}(?:[A-Z]+|\{[^}\s]+\})\n((?:^ {4}.*\n?)+)", text, re.MULTILINE)
-    return [name for listed in lists for name in re.findall(r"^ {4}([a-z][a-z0-9-]*)(?:  |$)", listed, re.MULTILINE)]
+def _named(helps: Mapping[str, str]) -> Iterator[str]:
+    """Yield the commands themselves, and what the help of each names."""
+    for command, text in helps.items():
+        yield command
+        chosen = [word for choices in re.findall(r"\{([^}]+)\}", text) for word in choices.split(",")]
+        for word in (*chosen, *re.findall(r"--[a-z][a-z0-9-]*", text)):
+            yield f"{command} {word}".strip()
 
 
 def api(pair: Pair, _: Options) -> Finding:
