@@ -429,7 +429,11 @@ def test_text_that_is_not_a_site_is_refused(text: str, where: str, what: str) ->
         ({"arrays.south.geometry": "a\0b"}, "arrays.south.geometry", "without NUL characters, got 'a\\x00b'"),
         ({"calibration": "a\0b"}, "calibration", "without NUL characters"),
         ({"zones_file": "a\0b"}, "zones_file", "without NUL characters"),
-        ({"room.size_m": [999.0] * 3, "grid.spacing_m": 1e-4}, "grid.spacing_m", "at most 1e+18 grid points, got 1e+21"),
+        (
+            {"room.size_m": [999.0] * 3, "grid.spacing_m": 1e-4},
+            "grid.spacing_m",
+            "at most 1e+18 grid points, got 1e+21",
+        ),
         ({"nodes.lab-pc.device": {"type": "scene", "seed": -1}}, "nodes.lab-pc.device.seed", "greater than or equal"),
     ],
 )

@@ -44,7 +44,9 @@ def read_token(token_file: Path) -> str:
     except UnicodeDecodeError as error:
         raise UseError(f"--token-file: expected a token in {token_file}, got bytes that are no text") from error
     if not (token and token.isascii() and token.isprintable()):
-        raise UseError(f"--token-file: expected the line that `livessl keys token` printed in {token_file}, got another")
+        raise UseError(
+            f"--token-file: expected the line that `livessl keys token` printed in {token_file}, got another"
+        )
     return token
 
 
@@ -87,9 +89,7 @@ def fetch(address: str, token_file: Path | None) -> bytes:
     return _answer(address, token_file, None, ANSWER_S)
 
 
-def order(
-    model: type[M], url: str, path: str, token_file: Path | None, value: Any, wait_s: float = ANSWER_S
-) -> M:
+def order(model: type[M], url: str, path: str, token_file: Path | None, value: Any, wait_s: float = ANSWER_S) -> M:
     """Return a server's answer to `POST /api/v1/PATH` with a value as JSON.
 
     Parameters

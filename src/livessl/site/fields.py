@@ -14,7 +14,6 @@ Bounds = tuple[Interval, Interval, Interval]
 BandHz = tuple[Annotated[float, Field(ge=0)], Positive]
 
 
-
 def without_nul(name: str) -> str:
     """Return the path of a file; raise `ValueError` if no file can have it."""
     if "\0" in name:
