@@ -13,8 +13,8 @@ from typing import Final
 import httpx
 import psycopg
 
-from history import Times
-from history_rows import START_NS
+from history import ZONES, Times
+from history_rows import START_NS, STEP_NS
 from hub_sites import site_name
 from hub_world import HubProcess
 from livessl.clock import SystemClock, utc_text
@@ -27,6 +27,9 @@ from small_site import wait_until
 
 REQUEST_S: Final = 0.05
 """Interval, in seconds, at which the API is asked."""
+
+Requests = dict[str, Callable[[], str]]
+"""What is asked for, by its name: each call returns the path of a request."""
 
 
 @dataclass
@@ -73,18 +76,22 @@ def running_hub_process(folder: Path, sqlite: bool, database: str | None = None)
         yield World(server, hub, postgresql, folder)
 
 
-def measure_answers(url: str, sites: int, seconds: float) -> JsonObject:
-    """Return how long answers of the API take, asked for some seconds in turns."""
+def measure_answers(url: str, sites: int, seconds: float, stored: int | None = None) -> JsonObject:
+    """Return how long answers of the API take, asked for some seconds in turns.
+
+    Parameters
+    ----------
+    url : str
+        The hub's address.
+    sites : int
+    seconds : float
+    stored : int or None
+        Number of events of a filled history, in which events are searched by further filters; None for any other one.
+    """
     rng = random.Random(6)
-    requests: dict[str, Callable[[], str]] = {
-        "newest of all": lambda: "/api/v1/events",
-        "newest of a site": lambda: f"/api/v1/events?site={site_name(rng.randrange(sites))}",
-        "of a site, by time and confidence": lambda: (
-            f"/api/v1/events?site={site_name(rng.randrange(sites))}&min_confidence=0.9&since={utc_text(START_NS)}"
-        ),
-        "all sites": lambda: "/api/v1/sites",
-        "metrics": lambda: "/metrics",
-    }
+    requests = {**_state_requests(), **_site_requests(rng, sites)}
+    if stored is not None:
+        requests |= _search_requests(rng, sites, stored)
     times: dict[str, list[float]] = {kind: [] for kind in requests}
     until = time.perf_counter() + seconds
     with httpx.Client(base_url=url, timeout=120) as client:
@@ -95,3 +102,38 @@ def measure_answers(url: str, sites: int, seconds: float) -> JsonObject:
                 times[kind].append(time.perf_counter() - begun)
                 time.sleep(REQUEST_S)
     return {kind: asdict(Times.of(each)) for kind, each in times.items()}
+
+
+def _state_requests() -> Requests:
+    return {"all sites": lambda: "/api/v1/sites", "metrics": lambda: "/metrics"}
+
+
+def _site_requests(rng: random.Random, sites: int) -> Requests:
+    return {
+        "newest of all": lambda: "/api/v1/events",
+        "newest of a site": lambda: f"/api/v1/events?site={site_name(rng.randrange(sites))}",
+        "of a site, by time and confidence": lambda: (
+            f"/api/v1/events?site={site_name(rng.randrange(sites))}&min_confidence=0.9&since={utc_text(START_NS)}"
+        ),
+    }
+
+
+def _search_requests(rng: random.Random, sites: int, stored: int) -> Requests:
+    """Return searches by the further filters of `GET events`, over all times that a filled history has."""
+
+    def until() -> str:
+        return utc_text(START_NS + rng.randrange(stored) * STEP_NS)
+
+    return {
+        "of a site, before a time": lambda: f"/api/v1/events?site={site_name(rng.randrange(sites))}&until={until()}",
+        "of a site and zone": lambda: (
+            f"/api/v1/events?site={site_name(rng.randrange(sites))}&zone=zone-{rng.randrange(ZONES)}"
+        ),
+        "of a site and array, refused": lambda: (
+            f"/api/v1/events?site={site_name(rng.randrange(sites))}&array=south&status=refused"
+        ),
+        "of all, before a time": lambda: f"/api/v1/events?until={until()}",
+        "of all, by zone and confidence": lambda: (
+            f"/api/v1/events?zone=zone-{rng.randrange(ZONES)}&min_confidence=0.99&until={until()}"
+        ),
+    }

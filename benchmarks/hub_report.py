@@ -48,9 +48,10 @@ def document(folder: Path) -> str:
     ValueError
         If there is nothing.
     """
-    loads, histories = _read(folder, "sites"), _read(folder, "history")
-    if not loads and not histories:
-        raise ValueError(f"{folder}: expected files sites-N.json or history-N.json; measure with --sites or --history")
+    loads, hours, histories = _read(folder, "sites"), _read(folder, "hour"), _read(folder, "history")
+    if not (loads or hours or histories):
+        what = "expected files sites-N.json, hour-N.json or history-N.json; measure with --sites, --hour or --history"
+        raise ValueError(f"{folder}: {what}")
     blocks: list[Block] = []
     if loads:
         blocks += [_about(loads), _flood(loads), "Processor time and disk of that:", _costs(loads), *_limits(loads)]
@@ -61,8 +62,15 @@ def document(folder: Path) -> str:
                 "95 % of the API's answers take at most, in ms, at the pace of real time:",
                 _answers(paced, "sites"),
             ]
+    for hour in hours:
+        blocks += _hour(hour)
     if histories:
-        blocks += [_about(histories), "95 % of the API's answers take at most, in ms:", _answers(histories, "history")]
+        blocks += [
+            _about(histories),
+            _stored(histories),
+            "95 % of the API's answers take at most, in ms:",
+            _answers(histories, "history"),
+        ]
         blocks += _fit(histories)
     return as_markdown(blocks)
 
@@ -131,12 +139,57 @@ def _paced(loads: Sequence[Json]) -> Table:
         rows.append(
             (
                 *(f"{load['sites']}", f"{paced['messages_per_s']:.0f}", f"{load['sites'] / REPORT_S:.1f}"),
-                f"{lag['p50_ms'] / 1000:.2f}, {lag['p95_ms'] / 1000:.2f}, {lag['max_ms'] / 1000:.2f} s",
-                *(_number(100 * shares[name] if name in shares else None, 1, " % of a core") for name in PARTS),
+                _ages(lag),
+                *(_share(shares, name) for name in PARTS),
                 f"{load['hub_memory_mb']:.0f} MB",
             )
         )
     return Table(titles, rows)
+
+
+def _hour(run: Json) -> list[Block]:
+    """Return how it went when sites sent their hour at a multiple of its pace."""
+    messages, events, sites = run["messages"], run["events"], run["hour"]
+    days, taken = sites * run["minutes"] / 60 / 24, "all" if run["is_drained"] else "not all"
+    text = (
+        f"{run['minutes']} minutes of {sites} sites at {run['times_real']:g} times their pace: {messages} messages "
+        f"with {events} events in {run['took_s']:.0f} s, {taken} taken in at the end. "
+        f"The stream grew to {run['stream_bytes'] / 1e6:.0f} MB and the database by {run['database_bytes'] / 1e6:.0f} "
+        f"MB, which is {run['database_bytes'] / 1e6 / days:.1f} MB a day for a site."
+    )
+    titles = ("until minute", "messages /s", "age of the oldest that waits: median, 95 %, longest", "most that waited",
+              *PARTS.values(), "memory of the hub", "slowest kind of answer, 95 %")  # fmt: skip
+    rows = []
+    for part in run["parts"]:
+        slowest = max(part["answers"], key=lambda kind: float(part["answers"][kind]["p95_ms"]))
+        rows.append(
+            (
+                *(f"{part['until_minute']:g}", f"{part['messages_per_s']:.0f}", _ages(part["lag"])),
+                f"{part['most_waiting']}",
+                *(_share(part["processor_share"], name) for name in PARTS),
+                f"{part['hub_memory_mb']:.0f} MB",
+                f"{part['answers'][slowest]['p95_ms']:.0f} ms ({slowest})",
+            )
+        )
+    return [_about([run]), text, Table(titles, rows)]
+
+
+def _ages(lag: Json) -> str:
+    return f"{lag['p50_ms'] / 1000:.2f}, {lag['p95_ms'] / 1000:.2f}, {lag['max_ms'] / 1000:.2f} s"
+
+
+def _share(shares: Json, name: str) -> str:
+    return _number(100 * shares[name] if name in shares else None, 1, " % of a core")
+
+
+def _stored(runs: Sequence[Json]) -> str:
+    """Return what the largest history takes."""
+    run = runs[-1]
+    size, count = run["database_bytes"], run["history"]
+    return (
+        f"{count} events of {run['sites']} sites take {size / 1e9:.1f} GB, {size / count:.0f} bytes an event. They "
+        f"were made by the database itself; the last step took {run['filled_s']:.0f} s."
+    )
 
 
 def _limits(loads: Sequence[Json]) -> list[Block]:

@@ -90,3 +90,14 @@ def test_tests_that_a_table_names_exist() -> None:
         if f"def test_{name}(" not in (ROOT / "tests" / file).read_text(encoding="utf-8")
     ]
     assert missing == []
+
+
+def test_troubleshooting_has_each_message_once_in_a_section() -> None:
+    sections = re.split(r"^## ", (ROOT / "docs" / "troubleshooting.md").read_text(encoding="utf-8"), flags=re.MULTILINE)
+    messages = [
+        (section.partition("\n")[0], message)
+        for section in sections
+        for message in re.findall(r"^\| `([^`]+)`", section, re.MULTILINE)
+    ]
+    assert len(messages) > 200
+    assert sorted({one for one in messages if messages.count(one) > 1}) == []

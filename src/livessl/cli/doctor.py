@@ -6,7 +6,7 @@ import argparse
 import json
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 from livessl.cli import progress
 from livessl.cli.exits import FAILED, OK
@@ -16,17 +16,11 @@ from livessl.cli.server_answers import add_server, ask_for
 from livessl.errors import UseError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from livessl.core.commission.blind_spots import BlindSpot
+    from livessl.core.commission.blind_spot import BlindSpot
     from livessl.core.commission.finding import Finding
     from livessl.examination import Examination
     from livessl.recordings.assign import AssignedRecording
     from livessl.site.models import Site
-
-MOST_SHIFT_M: Final = 1000.0
-MOST_TURN_DEG: Final = 180.0
-"""Shift, in metres, and turn, in degrees, from which the size of what the sounds cannot show is left out: any size."""
 
 
 def add_arguments(parser: Any) -> None:
@@ -36,9 +30,9 @@ def add_arguments(parser: Any) -> None:
     add_json(parser, "print one JSON object per finding")
 
 
-def add_recordings(parser: Any) -> None:
-    """Add --site, --session, --wav, --channels and --joint, which `recordings_given` reads."""
-    parser.add_argument("--site", type=Path, help="site file (default: the session's own)")
+def add_recordings(parser: Any, site: str = "site file (default: the session's own)") -> None:
+    """Add --site with a help text, --session, --wav, --channels and --joint, which `recordings_given` reads."""
+    parser.add_argument("--site", type=Path, help=site)
     parser.add_argument(
         "--session", action="append", type=Path, default=[], metavar="DIR", help="recorded session; repeatable"
     )
@@ -63,8 +57,8 @@ def run(arguments: argparse.Namespace) -> int:
         )
     elif not examination.findings and not arguments.json:
         print(f"no fault found in {_count(examination.sounds)}")
-    for line in blind_spot_lines(examination.blind_spots):
-        complain(line, kind="note")
+    for spot in examination.blind_spots:
+        complain(blind_spot_line(spot), kind="note")
     return OK if examination.is_faultless else FAILED
 
 
@@ -79,13 +73,18 @@ def _examine(arguments: argparse.Namespace) -> Examination:
 
 def _ask(url: str, token_file: Path | None) -> Examination:
     """Return what a running server has found."""
+    from livessl.core.commission.blind_spot import BlindSpot
     from livessl.core.commission.finding import Finding
     from livessl.examination import Examination
     from livessl.schema.answers import Findings
 
     answer = ask_for(Findings, url, "findings", token_file)
-    found = tuple(Finding(**one.model_dump(exclude={"kind"})) for one in answer.findings)
-    return Examination(found, answer.sounds)
+    findings = tuple(Finding(**one.model_dump(exclude={"kind"})) for one in answer.findings)
+    blind_spots = tuple(
+        BlindSpot(one.fault, tuple(one.arrays), one.least, tuple(one.along))
+        for one in answer.blind_spots
+    )
+    return Examination(findings, answer.sounds, blind_spots)
 
 
 def recordings_given(
@@ -122,23 +121,11 @@ def finding_line(finding: Finding) -> str:
     )
 
 
-def blind_spot_lines(spots: Sequence[BlindSpot]) -> list[str]:
-    """Return a line for each fault that the sounds could not have shown."""
-    lines = []
-    for spot in spots:
-        names = " or ".join(repr(name) for name in spot.arrays)
-        along = ", ".join(f"{x:.2f}" for x in spot.along)
-        if spot.fault == "turned":
-            size = f" by less than {spot.least:.0f} degrees" if spot.least < MOST_TURN_DEG else ""
-            how = f"turned{size} about ({along})"
-        else:
-            size = f" by less than {spot.least:.1f} m" if spot.least < MOST_SHIFT_M else ""
-            how = f"moved{size} along ({along})"
-        lines.append(
-            f"these sounds cannot show whether {names} is {how}; clap at places that you know, and run livessl "
-            "calibrate verify"
-        )
-    return lines
+def blind_spot_line(spot: BlindSpot) -> str:
+    """Return as a line of text what the sounds could not have shown."""
+    from livessl.core.commission.blind_spot import CURE
+
+    return f"{spot.message}; {CURE}"
 
 
 def _count(sounds: int) -> str:

@@ -35,8 +35,8 @@ def add_arguments(parser: Any) -> None:
     add(
         "experiment",
         choices=[*sorted(EXPERIMENTS), LOCALIZER, REPORT],
-        help=f"experiment of the paper; {LOCALIZER} compares the methods onset and srp-phat; {REPORT} only reports on "
-        "the folders of --with",
+        help=f"experiment of the paper; {LOCALIZER} compares the methods onset and srp-phat; {REPORT} runs nothing: it "
+        "reports on the folders of --with",
     )
     add("--site", type=Path, help="site file whose room and arrays replace the paper's; for one-array and diversity")
     add("--events", type=Path, metavar="DIR", help="folder of sounds to play, named like doorslam001.wav")
@@ -67,8 +67,8 @@ def _add_simulation(group: Any) -> None:
     add(
         "--snr",
         metavar="DB[,DB…]",
-        help="signal-to-noise ratio: white sensor noise this far below each recording's mean power; inf for no noise "
-        f"(default: no noise); only {LOCALIZER} takes several",
+        help="signal-to-noise ratio: white sensor noise, this many dB below each recording's mean power; inf for no "
+        f"noise (default: no noise); only {LOCALIZER} takes several",
     )
     add("--sample-rate", type=argument.positive, default=16000, metavar="HZ", help="sampling rate (default 16000)")
 

@@ -39,9 +39,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--min-confidence",
         type=argument.probability,
         metavar="C",
-        help="least confidence of events and updates, 0 to 1",
+        help="print only events and updates of at least this confidence, 0 to 1",
     )
-    add("--track", type=argument.count, metavar="N", help="print no tracks but number N")
+    add("--track", type=argument.count, metavar="N", help="of all tracks, print only number N")
     add(
         "--max-rate",
         type=argument.above_zero,

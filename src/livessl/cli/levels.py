@@ -16,7 +16,9 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: Any) -> None:
     """Describe the command's arguments."""
-    parser.add_argument("--device", metavar="NAME", help="name, or part of it, as `livessl devices` prints it")
+    parser.add_argument(
+        "--device", metavar="NAME", help="name of the device as `livessl devices` prints it, or a part of it"
+    )
     parser.add_argument("--site", type=Path, help="site file; meters the device of the node given by --node")
     parser.add_argument("--node", help="name of the node in the site file")
     parser.add_argument("--wav", type=Path, metavar="FILE", help="meter a WAV or FLAC file instead of a device")

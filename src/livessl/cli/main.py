@@ -42,7 +42,7 @@ class Command:
 COMMANDS: Final = (
     Command("demo", "locate sounds in a simulated room, without hardware", "livessl demo --once"),
     Command("serve", "run the fusion server with API and dashboard", "livessl serve --site site.yaml"),
-    Command("hub", "show the events of many sites together", "livessl hub --config hub.yaml"),
+    Command("hub", "run the hub, which collects the events of many sites", "livessl hub --config hub.yaml"),
     Command("events", "print live messages of a running server", "livessl events --zone door --json"),
     Command("capture", "run a capture node", "livessl capture --site site.yaml --node lab-pc"),
     Command(
@@ -69,7 +69,7 @@ COMMANDS: Final = (
     ),
     Command(
         "bench",
-        "measure how fast this machine locates, or how much load its server can carry",
+        "measure how fast this machine locates, or how much load a server on it carries",
         "livessl bench --live --arrays 64 --clients 20 --seconds 30",
     ),
     Command(
@@ -84,7 +84,7 @@ COMMANDS: Final = (
     ),
     Command(
         "calibrate",
-        "verify a set-up, and measure poses, by claps at places that you know",
+        "verify a set-up and measure poses, by claps at places that you know or, with refine, by any sounds",
         "livessl calibrate verify --session session/ --at 2,3,1.2 --at 6,8,1.2",
     ),
     Command(

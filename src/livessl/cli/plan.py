@@ -28,14 +28,15 @@ def add_arguments(parser: Any) -> None:
         "--height",
         type=argument.not_negative,
         metavar="M",
-        help="height of the sounds, metres (default 1.5, or the middle of the search volume if that ends below 1.5 m)",
+        help="height of the sounds, metres (default 1.5, or the middle of a search volume that ends below 1.5 m)",
     )
     parser.add_argument(
         "--calibration",
         type=argument.above_zero,
         default=CALIBRATION_M,
         metavar="M",
-        help=f"standard deviation of the microphone positions, metres (default {CALIBRATION_M:g})",
+        help="how exactly the positions of microphones are known, standard deviation in metres "
+        f"(default {CALIBRATION_M:g})",
     )
     add_json(parser, "print one JSON object")
     parser.add_argument("--out", type=Path, metavar="DIR", help="also write plan.json and plan.png to DIR")

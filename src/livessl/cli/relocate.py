@@ -28,22 +28,22 @@ def add_arguments(parser: Any) -> None:
     add = parser.add_argument
     add("clips", type=Path, nargs="?", help="folder of clips (default: that of server.clips in the site file)")
     add_site(parser)
-    add_method(parser)
+    add_method(parser, "that by which each event was located")
     add_joint(parser)
     add(
         "--set-up",
         choices=("then", "now"),
         default="then",
-        help="poses and speed of sound: those by which each event was located, or those of the site file with its "
+        help="poses and speed of sound; then: as when each event was located, now: as in the site file with its "
         "calibration (default: then)",
     )
-    add("--since", type=argument.time, metavar="TIME", help="only events that began then or later (RFC 3339)")
-    add("--until", type=argument.time, metavar="TIME", help="only events that began then or earlier (RFC 3339)")
+    add("--since", type=argument.time, metavar="TIME", help="only events that began at TIME or later (RFC 3339)")
+    add("--until", type=argument.time, metavar="TIME", help="only events that began at TIME or earlier (RFC 3339)")
     add(
         "--out",
         type=Path,
         metavar="FILE",
-        help="append the answers to FILE, one JSON object a line, and leave out the events that it has located already",
+        help="append the answers to FILE, one JSON object a line, and skip the events that FILE already answers",
     )
     add("--jobs", type=argument.positive, default=len(os.sched_getaffinity(0)), help="processes (default: all cores)")
     add_json(parser)

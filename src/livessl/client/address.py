@@ -91,7 +91,7 @@ class Address:
         Raises
         ------
         UnreachableError
-            If there is none; `UnavailableError` if the server says that it has none now.
+            If no answer comes; `UnavailableError` if the server answers that it cannot serve the request now.
         RefusedError
             If the request is wrong.
         """
@@ -117,7 +117,7 @@ class Address:
         return "; give a token" if self.token is None else "; give a token that is valid and has the role"
 
     def lost(self, error: Exception) -> RunError:
-        """Return the error to raise for one of the connection: a wrong certificate or address does not mend itself."""
+        """Return the error to raise for an error of the connection: `RefusedError` if further attempts would fail."""
         reason = error.reason if isinstance(error, urllib.error.URLError) else error
         if isinstance(reason, ssl.SSLError) and reason.reason in _NO_TLS:
             return RefusedError(f"{self.url}: what answers does not speak TLS ({reason.reason}); try http://")
@@ -132,14 +132,14 @@ _NO_TLS: Final = frozenset({"WRONG_VERSION_NUMBER", "HTTP_REQUEST", "PACKET_LENG
 
 
 class _Unredirected(urllib.request.HTTPRedirectHandler):
-    """Makes an error of every redirect: urllib would send the token to whatever host it names."""
+    """Makes an error of every redirect: urllib would send the token to whatever host the redirect names."""
 
     def redirect_request(self, *_: Any) -> None:
         """Follow nothing."""
 
 
 def open_url(request: urllib.request.Request, wait_s: float, context: ssl.SSLContext | None = None) -> Any:
-    """Return the answer to a request, which is a context manager; a redirect is not followed but is an `HTTPError`."""
+    """Return the answer to a request as a context manager; a redirect is not followed, but raises `HTTPError`."""
     handlers: list[Any] = [_Unredirected()]
     if context is not None:
         handlers.append(urllib.request.HTTPSHandler(context=context))
@@ -147,7 +147,7 @@ def open_url(request: urllib.request.Request, wait_s: float, context: ssl.SSLCon
 
 
 def redirection(error: urllib.error.HTTPError) -> str:
-    """Return where an answer sends the client, and what to do, as the rest of a sentence; empty if it does not."""
+    """Return where a redirect leads, and what to do, as the rest of a sentence; empty if the answer is no redirect."""
     target = error.headers.get("Location") if 300 <= error.code < 400 else None
     return "" if target is None else f", a redirect to {target}; give that server's address if you trust it"
 

@@ -17,7 +17,8 @@ from livessl.clock import Clock
 from livessl.federation.archive import Archive
 from livessl.federation.config import Hub
 from livessl.federation.intake import Intake
-from livessl.federation.routes import hub_routes, metrics_route
+from livessl.federation.metrics import metrics_route
+from livessl.federation.routes import hub_routes
 from livessl.schema.answers import errors
 from livessl.server.api.app import STATIC
 from livessl.server.api.auth import Access, Gate

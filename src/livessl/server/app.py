@@ -54,7 +54,7 @@ from livessl.server.tracks import Tracks
 from livessl.server.trails import Trails
 from livessl.server.zones.book import ZoneBook
 from livessl.server.zones.presence import Presence
-from livessl.server.zones.shapes import ZoneMap
+from livessl.server.zones.zone_map import ZoneMap
 from livessl.service_manager import ServiceManager
 from livessl.site.alert_checks import link_secret_file
 from livessl.site.checks import unprotected_addresses

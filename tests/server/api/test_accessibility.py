@@ -66,6 +66,18 @@ FINDINGS: Final = [
     }
     for fault, severity in (("swapped", "error"), ("hum", "warning"), ("aliasing", "info"))
 ]
+BLIND_SPOTS: Final = [
+    {
+        "kind": "blind_spot",
+        "fault": "moved",
+        "arrays": ["north", "south"],
+        "least_m": 0.8,
+        "least_deg": None,
+        "along": [1.0, 0.0, 0.0],
+        "message": "these sounds cannot show whether 'north' or 'south' is moved by less than 0.8 m along (1.00, …)",
+        "cure": "clap at places that you know, and run livessl calibrate verify",
+    }
+]
 
 
 @dataclass(frozen=True)
@@ -236,9 +248,10 @@ def answer_with(page: Page, path: str, **answer: Any) -> None:
 @pytest.mark.parametrize("role", ["operator", "viewer"])
 def test_set_up_view_of_each_role(browser: Browser, desk: Desk, role: str) -> None:
     with faultless_page(browser) as page:
-        answer_with(page, "findings", sounds=3, findings=FINDINGS)
+        answer_with(page, "findings", sounds=3, findings=FINDINGS, blind_spots=BLIND_SPOTS)
         opened(page, f"{desk.server.url}/#set-up", desk.tokens[role])
         expect(page.get_by_test_id("findings")).to_contain_text("exchange the plugs", timeout=MS)
+        expect(page.get_by_test_id("blind-spots")).to_contain_text("note these sounds cannot show", timeout=MS)
         expect(page.get_by_test_id("set-up-east")).to_have_attribute("data-state", "lost", timeout=MS)
         expect(page.locator("#move-array")).to_contain_text("south", timeout=MS)
         if role == "operator":

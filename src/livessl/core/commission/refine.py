@@ -1,8 +1,8 @@
 """Refines the poses of arrays and the speed of sound from sounds at unknown places, with at least one array known.
 
 The places of the sounds and the poses are estimated together. The delays within the arrays are enough: the arrays need
-no common clock. Where some have one, the times between them determine distances. Where the whole set-up is in the
-room cannot be determined so, and one array stays as it is filed.
+no common clock. Where some arrays have one, the times between these arrays determine distances. Sounds at unknown
+places do not show where in the room the whole set-up is, so one array at least stays as it is filed.
 """
 
 from __future__ import annotations
@@ -21,20 +21,21 @@ from livessl.core.commission.resection import SPEED_STD_M_S, MeasuredSetUp, desc
 from livessl.core.types import FloatArray
 
 LEAST_UNKNOWN: Final = 10
-"""Fewest sounds at unknown places from which an array is refined: each brings three unknowns of its own."""
+"""Fewest sounds at unknown places from which an array is refined: each sound brings three unknowns of its own."""
 
 POSITION_STD_M: Final = 0.5
 """Standard deviation of a filed position that is refined, metres: as exact as one that is paced out."""
 
 OUTLIER: Final = 3.5
-"""Misfit of a sound, in medians of all, from which it does not count: an array received an echo or another sound."""
+"""Misfit of a sound, in medians of all misfits, above which the sound is not used: an array received an echo or another
+sound."""
 
 LEAST_OUTLIER_S: Final = 30e-6
 """Misfit, in seconds, below which no sound is an outlier."""
 
 CONTRADICTION: Final = 3.0
-"""Misfit with the times between arrays, in misfits without them, from which they contradict the delays. Then they
-are left out, and positions are no better known than in the site file."""
+"""Misfit with the times between arrays, in misfits without these times, above which the times contradict the delays.
+Then the times are left out, and positions are no better known than in the site file."""
 
 LEAST_STD_S: Final = 5e-6
 """Least standard deviation of the delays that is assumed, seconds."""
@@ -59,7 +60,7 @@ def refine(
     microphones : mapping of array to (K, 3) float64
         As filed, metres. Orientations may be wrong.
     delays : mapping of array to (S, K) float64
-        Delays of the same sounds, seconds; NaN where an array did not receive one.
+        Delays of the same S sounds, seconds; NaN where an array did not receive a sound.
     bounds_m : (3, 2) float64
         Search volume, metres.
     c_m_s : float
@@ -74,7 +75,7 @@ def refine(
     Returns
     -------
     MeasuredSetUp
-        With the poses of the other arrays. The misfits of a pose count all arrays.
+        With the poses of the arrays that are not `known`. The misfits of a pose are those of all arrays together.
 
     Raises
     ------
@@ -147,7 +148,10 @@ def _rms(misfits_s: FloatArray) -> float:
 def _turned(
     microphones: Microphones, delays: Delays, search: PlaceSearch, free: Collection[str]
 ) -> dict[str, FloatArray]:
-    """Turn each free array so that its delays fit those of the known arrays best: where to begin."""
+    """Return the microphones with each free array turned so that its delays fit those of the known arrays best.
+
+    The adjustment begins there.
+    """
     found = dict(microphones)
     known = [name for name in microphones if name not in free]
     of_known = np.sum([search.costs(search.table_s(microphones[name]), delays[name]) for name in known], axis=0)

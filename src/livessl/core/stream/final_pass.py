@@ -88,7 +88,7 @@ class TwoPassFusion:
 
     @property
     def settled_of(self) -> dict[str, int]:
-        """The same for each array, by its own clock: as its node counts."""
+        """The frame index `settled` for each array, as the array's node counts by its own clock."""
         settled = self.settled
         return {} if settled is None else {name: settled + self._ahead(name) for name in self._receptions}
 

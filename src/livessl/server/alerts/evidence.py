@@ -10,7 +10,7 @@ from typing import Final, Protocol
 from livessl.core.types import Status
 from livessl.server.alerts.picture import picture_of
 from livessl.server.api.encode import JsonObject
-from livessl.server.zones.shapes import ZoneMap
+from livessl.server.zones.zone_map import ZoneMap
 from livessl.site.models import Site
 
 CLIP_WAIT_S: Final = 15.0

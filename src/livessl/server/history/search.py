@@ -17,10 +17,11 @@ def matching(query: Query, *columns: ColumnElement[Any]) -> tuple[Select[Any], F
     -------
     Select, FromClause
         The statement, and the table that has `time_ns` and `number` in the order of the index that is searched: with
-        a zone, an array, a site or a flag that of the tags, else that of the events.
+        a site, a zone, an array or a flag that of the tags, else that of the events. Of several it is the first of
+        these: a hub of many sites has far fewer events of one site than of one zone or array, whose names repeat.
     """
     flag = "excluded" if query.excluded else None
-    named = (("flag", flag), ("zone", query.zone), ("array", query.array), ("site", query.site))
+    named = (("site", query.site), ("flag", flag), ("zone", query.zone), ("array", query.array))
     wanted = [(kind, name) for kind, name in named if name is not None]
     searched: FromClause = tags if wanted else events
     statement = select(*columns)
