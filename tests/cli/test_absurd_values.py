@@ -114,7 +114,7 @@ HEARD = {"number": 1, "id": "lab-1", "time_utc": "2026-01-31T12:00:00Z", "positi
          "status": "located", "reason": None, "observations": [OBSERVATION]}  # fmt: skip
 SOUNDS = {"v": 1, "now_utc": "2026-01-31T12:00:00Z", "last": 1, "sounds": [HEARD]}
 
-VALUES = st.one_of(
+VALUES: st.SearchStrategy[Any] = st.one_of(
     st.sampled_from([None, True, "", "x", [], {}, [[]], -1, 0.5, 10**400]),
     st.floats(allow_nan=True),
     st.text(max_size=3),
