@@ -199,6 +199,7 @@ class BlindSpot(Model):
     def least(self) -> float:
         """`least_m` of a shift, and `least_deg` of a turn; NaN in an answer that has neither."""
         return next((least for least in (self.least_m, self.least_deg) if least is not None), math.nan)
+
     cure: str = Field(
         description="What would show it.", examples=["clap at places that you know, and run livessl calibrate verify"]
     )
@@ -212,7 +213,7 @@ class Findings(Versioned):
     blind_spots: list[BlindSpot] = Field(
         default=[],  # of a server that is older than the field
         description="What these sounds cannot show about poses. Empty with fewer than three sounds of two arrays, and "
-        "while a finding is about poses: then sizes would not hold."
+        "while a finding is about poses: then sizes would not hold.",
     )
 
 
