@@ -112,7 +112,7 @@ def test_answers_of_another_calibration_are_refused(
     before = out.read_bytes()
     done = run(*command, write_site(tmp_path, {**server, **changes}), *options)
     assert done.code == 2
-    assert "has answers of another calibration, --joint, site file or release" in done.err
+    assert "has answers of another calibration, --joint, site file, server or release" in done.err
     assert out.read_bytes() == before
 
 

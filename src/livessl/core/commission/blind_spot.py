@@ -8,9 +8,11 @@ from typing import Final
 CURE: Final = "clap at places that you know, and run livessl calibrate verify"
 """What shows a fault that sounds at unknown places hide."""
 
-_ANY_SHIFT_M: Final = 1000.0
-_ANY_TURN_DEG: Final = 180.0
-"""Shift, in metres, and turn, in degrees, from which the size is left out of the sentence: the sounds show none."""
+MOST_SHIFT_M: Final = 1000.0
+"""Least shift, in metres, from which on no shift would show, so that no size is told."""
+
+MOST_TURN_DEG: Final = 180.0
+"""The same of turns, in degrees."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,9 +42,9 @@ class BlindSpot:
         names = " or ".join(repr(name) for name in self.arrays)
         along = ", ".join(f"{x:.2f}" for x in self.along)
         if self.fault == "turned":
-            size = f" by less than {self.least:.0f} degrees" if self.least < _ANY_TURN_DEG else ""
+            size = f" by less than {self.least:.0f} degrees" if self.least < MOST_TURN_DEG else ""
             how = f"turned{size} about ({along})"
         else:
-            size = f" by less than {self.least:.1f} m" if self.least < _ANY_SHIFT_M else ""
+            size = f" by less than {self.least:.1f} m" if self.least < MOST_SHIFT_M else ""
             how = f"moved{size} along ({along})"
         return f"these sounds cannot show whether {names} is {how}"
