@@ -11,9 +11,9 @@ import pytest
 import soundfile
 
 from cli.command_runs import Recorded, Run
-from livessl.cli.doctor import blind_spot_lines
+from livessl.cli.doctor import blind_spot_line
 from livessl.cli.main import main
-from livessl.core.commission.blind_spots import BlindSpot
+from livessl.core.commission.blind_spot import BlindSpot
 from livessl.core.types import Float32Array
 from small_site import RATE_HZ, hiss, write_site, write_wav
 
@@ -130,12 +130,8 @@ def test_wrong_use_is_told_in_one_line(run: Run, options: list[str], words: str)
 
 
 def test_what_the_sounds_hide_is_said_with_its_size_direction_and_cure() -> None:
-    moved, turned = blind_spot_lines(
-        [
-            BlindSpot("moved", ("north", "south"), 0.84, (0.6, 0.8, 0.0)),
-            BlindSpot("turned", ("west",), 12.4, (0.0, 0.0, 1.0)),
-        ]
-    )
+    moved = blind_spot_line(BlindSpot("moved", ("north", "south"), 0.84, (0.6, 0.8, 0.0)))
+    turned = blind_spot_line(BlindSpot("turned", ("west",), 12.4, (0.0, 0.0, 1.0)))
     assert "whether 'north' or 'south' is moved by less than 0.8 m along (0.60, 0.80, 0.00)" in moved
     assert "whether 'west' is turned by less than 12 degrees about (0.00, 0.00, 1.00)" in turned
     assert all(

@@ -16,6 +16,7 @@ from livessl.clock import SystemClock, UnpacedClock
 from livessl.core.types import Float32Array
 from livessl.recordings.assign import AssignedRecording
 from livessl.recordings.recording import MemoryRecording
+from livessl.schema.answers import Findings
 from livessl.server.app import Server
 from small_site import RATE_HZ, heard, running_server, site_of, wait_until
 
@@ -47,7 +48,7 @@ def test_a_fault_makes_its_array_degraded_and_ends_when_it_is_mended(
         wait_until(lambda: server.parts.set_up_watch.state.sounds == SOUNDS, "all sounds")
     answer = httpx.get(f"{server.url}/api/v1/findings").json()
     (finding,) = answer["findings"]
-    assert answer["sounds"] == SOUNDS
+    assert (answer["sounds"], answer["blind_spots"]) == (SOUNDS, [])
     assert (finding["fault"], finding["array"], finding["severity"]) == ("swapped", "south", "error")
     assert "channels 2 and 3 of 'south' are swapped" in caplog.text
     states = {array["name"]: array for array in httpx.get(f"{server.url}/api/v1/arrays").json()["arrays"]}
@@ -61,8 +62,14 @@ def test_a_fault_makes_its_array_degraded_and_ends_when_it_is_mended(
 
     replayed(server, heard("south", SOUNDS), "mended")
     wait_until(lambda: httpx.get(f"{server.url}/api/v1/findings").json()["sounds"] == SOUNDS, "all sounds")
-    assert httpx.get(f"{server.url}/api/v1/findings").json()["findings"] == []
-    assert run("doctor", "--url", server.url).out == f"no fault found in {SOUNDS} sounds\n"
+    mended = httpx.get(f"{server.url}/api/v1/findings").json()
+    Findings.model_validate_json(json.dumps(mended), strict=True)
+    assert mended["findings"] == []
+    assert mended["blind_spots"]  # two arrays hide a shift along the line between them
+    done = run("doctor", "--url", server.url)
+    assert done.out == f"no fault found in {SOUNDS} sounds\n"
+    told = [line.removeprefix("livessl: note: ") for line in done.err.splitlines()]
+    assert told == [f"{spot['message']}; {spot['cure']}" for spot in mended["blind_spots"]]
 
 
 def test_an_inverted_channel_is_named_with_the_input_of_the_interface(server: Server) -> None:

@@ -13,6 +13,7 @@ import pytest
 from world import HandClock
 
 from alert_desk import sound
+from livessl.core.commission.blind_spot import BlindSpot
 from livessl.core.commission.finding import LEAST_SOUNDS, Finding, Severity
 from livessl.core.commission.steady import MOST_CONFIRMING
 from livessl.core.types import Observation
@@ -25,6 +26,7 @@ from small_site import HANG_S, site_of
 TURNED = Finding("turned", "south", None, Severity.ERROR, 0.9, "'south' is turned", "turn it back")
 CONTRADICTION = Finding("moved", None, None, Severity.ERROR, 0.5, "the arrays contradict each other", "clap")
 WEAK = Finding("level", "north", 2, Severity.WARNING, 0.9, "channel 2 of 'north' is weaker", "set the gains alike")
+HIDDEN = BlindSpot("moved", ("north", "south"), 0.8, (1.0, 0.0, 0.0))
 SOUND = replace(sound(), received=cast(Any, ("north", "south")))  # what was received is not looked at
 
 
@@ -39,9 +41,11 @@ class Desk:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.found: Sequence[Finding] = ()
+        self.hidden: tuple[BlindSpot, ...] = ()
         self.examined: list[int] = []
         monkeypatch.setattr(heard_sounds, "observe", lambda received: received)
         monkeypatch.setattr(set_up, "find_set_up_faults", self._find)
+        monkeypatch.setattr(set_up, "hidden_by", lambda _site, _sounds: self.hidden)
         self.watch = SetUpWatch(site_of(), Overload(HandClock()))
 
     def hear(self, found: Sequence[Finding], sounds: int = 1) -> None:
@@ -50,6 +54,11 @@ class Desk:
         for _ in range(sounds):
             self.watch.take(SOUND)
             self.watch.examine()
+
+    def said(self) -> tuple[list[Finding], list[BlindSpot]]:
+        """The findings, and what the sounds hide."""
+        state = self.watch.state
+        return list(state.findings), list(state.blind_spots)
 
     def _find(self, _site: object, sounds: Sequence[object]) -> list[Finding]:
         self.examined.append(len(sounds))
@@ -130,6 +139,35 @@ def test_array_with_a_wrong_clock_has_no_part_in_the_examination(desk: Desk, mon
     desk.watch.note_clocks([])
     hear(KEPT_SOUNDS)
     assert (examined[-1], found()) == ({"north", "south"}, [TURNED])
+
+
+def test_what_the_sounds_hide_is_published_while_no_finding_is_about_poses(desk: Desk) -> None:
+    desk.hidden = (HIDDEN,)
+    desk.hear([WEAK], LEAST_SOUNDS - 1)
+    assert desk.said() == ([], [])
+    desk.hear([WEAK])
+    assert desk.said() == ([WEAK], [HIDDEN])
+    desk.hear([WEAK, TURNED], KEPT_SOUNDS)
+    assert desk.said() == ([TURNED, WEAK], [])
+    desk.hear([WEAK])
+    assert desk.said() == ([TURNED, WEAK], [])  # TURNED has not ended yet
+    desk.hear([], KEPT_SOUNDS)
+    assert desk.said() == ([], [HIDDEN])
+
+
+@pytest.mark.parametrize("ends", ["another run", "other poses", "a clock that is off"])
+def test_what_the_sounds_hide_ends_with_what_it_was_said_of(desk: Desk, ends: str) -> None:
+    desk.hidden = (HIDDEN,)
+    desk.hear([], LEAST_SOUNDS)
+    assert desk.said() == ([], [HIDDEN])
+    if ends == "another run":
+        desk.watch.forget()
+    elif ends == "other poses":
+        desk.watch.prepare(site_of())()
+    else:
+        desk.watch._sounds = ()  # what was received is not looked at here
+        desk.watch.note_clocks(["south"])
+    assert desk.said() == ([], [])
 
 
 def test_another_run_begins_without_findings(desk: Desk) -> None:

@@ -12,13 +12,11 @@ from livessl.cli import progress
 from livessl.cli.exits import FAILED, OK
 from livessl.cli.options import add_joint, add_json, add_wav, joints, read_site, wavs
 from livessl.cli.output import complain, print_warnings
-from livessl.cli.server_answers import add_server, ask
+from livessl.cli.server_answers import add_server, ask_for
 from livessl.errors import UseError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from livessl.core.commission.blind_spots import BlindSpot
+    from livessl.core.commission.blind_spot import BlindSpot
     from livessl.core.commission.finding import Finding
     from livessl.examination import Examination
     from livessl.recordings.assign import AssignedRecording
@@ -32,9 +30,9 @@ def add_arguments(parser: Any) -> None:
     add_json(parser, "print one JSON object per finding")
 
 
-def add_recordings(parser: Any) -> None:
-    """Add --site, --session, --wav, --channels and --joint, which `recordings_given` reads."""
-    parser.add_argument("--site", type=Path, help="site file (default: the session's own)")
+def add_recordings(parser: Any, site: str = "site file (default: the session's own)") -> None:
+    """Add --site with a help text, --session, --wav, --channels and --joint, which `recordings_given` reads."""
+    parser.add_argument("--site", type=Path, help=site)
     parser.add_argument(
         "--session", action="append", type=Path, default=[], metavar="DIR", help="recorded session; repeatable"
     )
@@ -59,8 +57,8 @@ def run(arguments: argparse.Namespace) -> int:
         )
     elif not examination.findings and not arguments.json:
         print(f"no fault found in {_count(examination.sounds)}")
-    for line in blind_spot_lines(examination.blind_spots):
-        complain(line, kind="note")
+    for spot in examination.blind_spots:
+        complain(blind_spot_line(spot), kind="note")
     return OK if examination.is_faultless else FAILED
 
 
@@ -75,14 +73,17 @@ def _examine(arguments: argparse.Namespace) -> Examination:
 
 def _ask(url: str, token_file: Path | None) -> Examination:
     """Return what a running server has found."""
-    from livessl.core.commission.finding import Finding, Severity
+    from livessl.core.commission.blind_spot import BlindSpot
+    from livessl.core.commission.finding import Finding
     from livessl.examination import Examination
+    from livessl.schema.answers import Findings
 
-    answer = ask(url, "findings", token_file)
-    for finding in answer["findings"]:
-        del finding["kind"]
-        finding["severity"] = Severity(finding["severity"])
-    return Examination(tuple(Finding(**finding) for finding in answer["findings"]), answer["sounds"])
+    answer = ask_for(Findings, url, "findings", token_file)
+    findings = tuple(Finding(**one.model_dump(exclude={"kind"})) for one in answer.findings)
+    blind_spots = tuple(
+        BlindSpot(one.fault, tuple(one.arrays), one.least, tuple(one.along)) for one in answer.blind_spots
+    )
+    return Examination(findings, answer.sounds, blind_spots)
 
 
 def recordings_given(
@@ -119,20 +120,11 @@ def finding_line(finding: Finding) -> str:
     )
 
 
-def blind_spot_lines(spots: Sequence[BlindSpot]) -> list[str]:
-    """Return a line for each fault that the sounds could not have shown."""
-    lines = []
-    for spot in spots:
-        names = " or ".join(repr(name) for name in spot.arrays)
-        along = ", ".join(f"{x:.2f}" for x in spot.along)
-        how = f"moved by less than {spot.least:.1f} m along ({along})"
-        if spot.fault == "turned":
-            how = f"turned by less than {spot.least:.0f} degrees about ({along})"
-        lines.append(
-            f"these sounds cannot show whether {names} is {how}; clap at places that you know, and run livessl "
-            "calibrate verify"
-        )
-    return lines
+def blind_spot_line(spot: BlindSpot) -> str:
+    """Return as a line of text what the sounds could not have shown."""
+    from livessl.core.commission.blind_spot import CURE
+
+    return f"{spot.message}; {CURE}"
 
 
 def _count(sounds: int) -> str:

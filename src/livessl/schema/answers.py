@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from enum import StrEnum
 from typing import Annotated, Any, Final, Literal
@@ -161,11 +162,58 @@ class Finding(Model):
     )
 
 
+class BlindSpot(Model):
+    """A shift or turn of an array that the last sounds would not show."""
+
+    kind: Literal["blind_spot"]
+    fault: Literal["moved", "turned"] = Field(description="Code of the fault that would stay hidden.")
+    arrays: list[str] = Field(
+        min_length=1,
+        description="The array; several if the same fault of each of them would be hidden alike.",
+        examples=[["north", "south"]],
+    )
+    least_m: float | None = Field(
+        gt=0,
+        description="Smallest shift, in metres, that these sounds would show in nine of ten cases; null for a turn.",
+        examples=[0.8],
+    )
+    least_deg: float | None = Field(
+        gt=0,
+        description="Smallest turn, in degrees, that these sounds would show in nine of ten cases; null for a shift.",
+        examples=[None],
+    )
+    along: list[float] = Field(
+        min_length=3,
+        max_length=3,
+        description="Direction of the shift, or axis of the turn: a unit vector [x, y, z] in the axes of the room.",
+        examples=[[0.96, 0.27, 0.0]],
+    )
+    message: str = Field(
+        description="What these sounds cannot show.",
+        examples=[
+            "these sounds cannot show whether 'north' or 'south' is moved by less than 0.8 m along (0.96, 0.27, 0.00)"
+        ],
+    )
+    cure: str = Field(
+        description="What would show it.", examples=["clap at places that you know, and run livessl calibrate verify"]
+    )
+
+    @property
+    def least(self) -> float:
+        """`least_m` of a shift, and `least_deg` of a turn; NaN in an answer that has neither."""
+        return next((least for least in (self.least_m, self.least_deg) if least is not None), math.nan)
+
+
 class Findings(Versioned):
-    """Faults of the set-up that the last sounds show, errors first."""
+    """Faults of the set-up that the last sounds show, errors first, and faults that they would not show."""
 
     sounds: int = Field(ge=0, description="Number of sounds that were examined; three are the least.", examples=[12])
     findings: list[Finding]
+    blind_spots: list[BlindSpot] = Field(
+        default=[],  # of a server that is older than the field
+        description="What these sounds cannot show about poses. Empty with fewer than three sounds of two arrays, and "
+        "while a finding is about poses: then sizes would not hold.",
+    )
 
 
 class Tracks(Versioned):

@@ -13,7 +13,8 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Final
 
-from livessl.core.commission.finding import LEAST_SOUNDS, Finding, Severity, in_order
+from livessl.core.commission.blind_spot import BlindSpot
+from livessl.core.commission.finding import LEAST_SOUNDS, Finding, Severity, are_poses_in_doubt, in_order
 from livessl.core.commission.report_watch import REPORTED
 from livessl.core.commission.steady import SteadyFindings
 from livessl.core.types import Event, Observation
@@ -48,12 +49,15 @@ class SetUpState:
         The error that concerns each array, in words; arrays without one are left out.
     are_reports_complete : bool
         Whether the nodes have reported for long enough to show all that their reports can show.
+    blind_spots : tuple of BlindSpot
+        Faults of poses that these sounds could not have shown; empty while a finding is about poses.
     """
 
     sounds: int = 0
     findings: tuple[Finding, ...] = ()
     errors: Mapping[str, str] = field(default_factory=dict)
     are_reports_complete: bool = False
+    blind_spots: tuple[BlindSpot, ...] = ()
 
     def knows(self, fault: str) -> bool:
         """Return whether a fault of this code that is no finding is known not to be there, or to have ended."""
@@ -88,6 +92,7 @@ class SetUpWatch:
         self._steady = SteadyFindings()
         self._of_layout = layout_findings(site)
         self._of_sounds: tuple[Finding, ...] = ()
+        self._blind_spots: tuple[BlindSpot, ...] = ()
         self._reported: tuple[Finding, ...] = ()  # by the nodes' reports, not by sounds
         self._are_reports_complete = False
         self._clocks_off: frozenset[str] = frozenset()  # arrays
@@ -174,10 +179,11 @@ class SetUpWatch:
         if not (new or is_moved):
             return
         # imported late: scipy's optimizer takes memory, and no event needs it
-        from livessl.site.build.set_up import find_set_up_faults
+        from livessl.site.build.set_up import find_set_up_faults, hidden_by
 
         sounds = [*known, *(self._on_time(sound.observations) for sound in new)][-KEPT_SOUNDS:]
         findings = find_set_up_faults(site, sounds) if len(sounds) >= LEAST_SOUNDS else None
+        blind_spots = () if findings is None or are_poses_in_doubt(findings) else hidden_by(site, sounds)
         with self._lock:
             if run != self._run:
                 return
@@ -187,16 +193,17 @@ class SetUpWatch:
             if findings is None:
                 self._note(())
             else:
-                self._note(self._steady.note(findings, self._unjudged))
+                self._note(self._steady.note(findings, self._unjudged), blind_spots)
                 self._unjudged = 0
 
     def _on_time(self, sound: Sequence[Observation]) -> Sequence[Observation]:
         """Return what the arrays whose clocks are right received of a sound."""
         return tuple(one for one in sound if one.array not in self._clocks_off) if self._clocks_off else sound
 
-    def _note(self, findings: Sequence[Finding]) -> None:
+    def _note(self, findings: Sequence[Finding], blind_spots: tuple[BlindSpot, ...] = ()) -> None:
         self._log_new(self._of_sounds, findings)
         self._of_sounds = tuple(findings)
+        self._blind_spots = () if are_poses_in_doubt(findings) else blind_spots
         self._publish()
 
     def _publish(self) -> None:
@@ -209,7 +216,9 @@ class SetUpWatch:
             for array in ([finding.array] if finding.array is not None else all_arrays)
         }
         findings = in_order([*self._of_sounds, *self._reported, *self._of_layout])
-        self.state = SetUpState(len(self._sounds), tuple(findings), errors, self._are_reports_complete)
+        self.state = SetUpState(
+            len(self._sounds), tuple(findings), errors, self._are_reports_complete, self._blind_spots
+        )
 
     @staticmethod
     def _log_new(known: Sequence[Finding], findings: Sequence[Finding]) -> None:

@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from set_ups import BOUNDS_M, C_M_S, Arrays, delays_of, set_up, sources, turned
 
-from livessl.core.commission.blind_spots import MOST_HIDDEN_M, BlindSpot, blind_spots
+from livessl.core.commission.blind_spot import BlindSpot
+from livessl.core.commission.blind_spots import MOST_HIDDEN_M, blind_spots
 from livessl.core.commission.diagnosis import Diagnosis, diagnose
 from livessl.core.commission.set_up import Known, careful
 from livessl.core.types import FloatArray

@@ -8,11 +8,12 @@ slopes of the delays, with the places of the sounds eliminated and every array a
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 
+from livessl.core.commission.blind_spot import BlindSpot
 from livessl.core.commission.diagnosis import most_telling, of_sounds
 from livessl.core.commission.finding import LEAST_SOUNDS
 from livessl.core.commission.judge import COSTS, least_gain
@@ -36,28 +37,6 @@ _SAME_RATIO: Final = 1.1
 
 _LEAST_SEEN: Final = 1e-12
 """Least growth of the deviance for each metre or degree squared, so that what nothing shows has a size at all."""
-
-
-@dataclass(frozen=True, slots=True)
-class BlindSpot:
-    """A fault of a pose that some sounds would not show.
-
-    Parameters
-    ----------
-    fault : str
-        `moved` or `turned`.
-    arrays : tuple of str
-        The array; several if the same fault of each of them would be hidden alike.
-    least : float
-        Smallest shift, in metres, or turn, in degrees, that the sounds would show in nine of ten cases.
-    along : (3,) tuple of float
-        Unit vector of the shift, or of the axis of the turn.
-    """
-
-    fault: str
-    arrays: tuple[str, ...]
-    least: float
-    along: tuple[float, ...]
 
 
 def blind_spots(

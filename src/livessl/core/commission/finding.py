@@ -10,6 +10,11 @@ from typing import Final
 LEAST_SOUNDS: Final = 3
 """Fewest sounds from which anything is concluded."""
 
+OF_SET_UP: Final = frozenset(
+    {"swapped", "mirrored", "exchanged", "turned", "moved", "late_channel", "geometry", "temperature"}
+)
+"""Codes of what the delays of all sounds show together."""
+
 
 class Severity(StrEnum):
     """Weight of a finding: with an error, positions are wrong or refused; with a warning, they are worse."""
@@ -50,6 +55,11 @@ class Finding:
     message: str
     cure: str
     input: int | None = None
+
+
+def are_poses_in_doubt(findings: Iterable[Finding]) -> bool:
+    """Return whether a finding is about the poses, or about clocks that let arrays receive different sounds."""
+    return any(one.fault in OF_SET_UP or one.fault == "clock" for one in findings)
 
 
 def in_order(findings: Iterable[Finding]) -> list[Finding]:

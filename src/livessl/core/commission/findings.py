@@ -15,11 +15,6 @@ from livessl.core.commission.places import Delays, Microphones, stacked
 from livessl.core.commission.set_up import DELAY_STD_S, Freedom, Known, careful
 from livessl.core.types import BoolArray, FloatArray, Observation
 
-OF_SET_UP: Final = frozenset(
-    {"swapped", "mirrored", "exchanged", "turned", "moved", "late_channel", "geometry", "temperature"}
-)
-"""Codes of what the delays of all sounds show together."""
-
 EXACT_S: Final = 2e-6
 """Standard deviation, in seconds, of a delay whose pairs agree perfectly: converters and microphones differ by as
 much."""
@@ -31,11 +26,12 @@ DEAF_COHERENCE: Final = 0.35
 """Coherence, relative to the array's clearest channels, below which a channel did not receive the sound."""
 
 LEVEL_DB: Final = 3.0
-"""Median difference of level within an array, in decibels, that is told after `LEVEL_SOUNDS` sounds: the medians of ten
-sounds differ by less than 0.7 dB between good channels."""
+"""Median difference of level within an array, in decibels, that is reported after `LEVEL_SOUNDS` sounds: the medians of
+ten sounds differ by less than 0.7 dB between good channels."""
 
 LEVEL_DB_AT_ONCE: Final = 6.0
-"""The same after fewer sounds, of which single ones differ by up to 3 dB."""
+"""Median difference of level, in decibels, that is reported after fewer than `LEVEL_SOUNDS` sounds: in a single sound,
+good channels differ by up to 3 dB."""
 
 LEVEL_SOUNDS: Final = 8
 

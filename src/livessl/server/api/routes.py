@@ -14,6 +14,7 @@ from pydantic import WithJsonSchema
 
 from livessl import __version__
 from livessl.clock import utc_text
+from livessl.core.commission.blind_spot import CURE, BlindSpot
 from livessl.core.types import FRAME_S
 from livessl.schema import answers
 from livessl.schema.answers import errors
@@ -80,6 +81,20 @@ def _privacy(site: Site) -> JsonObject:
     return {"mode": site.privacy, "retention_days": site.store.retention_days}
 
 
+def _blind_spot(spot: BlindSpot) -> JsonObject:
+    is_turn = spot.fault == "turned"
+    return {
+        "kind": "blind_spot",
+        "fault": spot.fault,
+        "arrays": list(spot.arrays),
+        "least_m": None if is_turn else spot.least,
+        "least_deg": spot.least if is_turn else None,
+        "along": list(spot.along),
+        "message": spot.message,
+        "cure": CURE,
+    }
+
+
 def _secured(site: Site) -> JsonObject:
     return {
         "nodes": site.keys is not None,
@@ -109,10 +124,11 @@ def state_routes(parts: Parts) -> APIRouter:
 
     @router.get("/api/v1/findings", tags=["state"], response_model=answers.Findings)
     def get_findings() -> Response:
-        """Faults of the set-up that the last sounds show, errors first."""
+        """Faults of the set-up that the last sounds show, errors first, and faults that they would not show."""
         state = parts.set_up_watch.state
         findings = [{"kind": "finding", **asdict(finding)} for finding in state.findings]
-        return as_json({"v": API_VERSION, "sounds": state.sounds, "findings": findings})
+        blind_spots = [_blind_spot(spot) for spot in state.blind_spots]
+        return as_json({"v": API_VERSION, "sounds": state.sounds, "findings": findings, "blind_spots": blind_spots})
 
     @router.get("/api/v1/tracks", tags=["estimates"], response_model=answers.Tracks)
     def get_tracks() -> Response:

@@ -1,4 +1,4 @@
-// A finding of the doctor as an item of a list.
+// What the doctor says, as items of lists.
 
 import { el } from "./dom.js";
 
@@ -8,4 +8,11 @@ export function findingItem({ fault, severity, message, cure, input, confidence 
   return el("li", { className: "finding", "data-severity": severity, "data-fault": fault },
     el("p", { className: "finding-what" }, el("b", { text: severity }), ` ${message}${where}`),
     el("p", { className: "finding-cure", text: `${cure}. ${Math.round(100 * confidence)} % sure.` }));
+}
+
+/** What the last sounds cannot show about poses, and what would show it, as an item of a list. */
+export function blindSpotItem({ fault, message, cure }) {
+  return el("li", { className: "finding", "data-severity": "note", "data-fault": fault },
+    el("p", { className: "finding-what" }, el("b", { text: "note" }), ` ${message}`),
+    el("p", { className: "finding-cure", text: `${cure}.` }));
 }

@@ -4,7 +4,7 @@ import { el, find, write } from "./dom.js";
 import { counted, number } from "./format.js";
 import { shownState } from "./model.js";
 import { ClapTest } from "./set-up-claps.js";
-import { findingItem } from "./set-up-findings.js";
+import { blindSpotItem, findingItem } from "./set-up-findings.js";
 import { ArrayMover } from "./set-up-move.js";
 import { PoseOverlay } from "./set-up-overlay.js";
 import { PosesPanel } from "./set-up-poses.js";
@@ -111,12 +111,13 @@ export class SetUp {
 
   async #loadFindings() {
     try {
-      const { sounds, findings } = await this.load("findings");
+      const { sounds, findings, blind_spots: blindSpots } = await this.load("findings");
       write(find("set-up-sounds"), sounds === 0 ? "no sound yet" : `from the last ${counted(sounds, "sound")}`);
       find("set-up-findings").replaceChildren(...findings.map(findingItem));
       const none = find("set-up-no-finding");
       none.hidden = findings.length > 0;
       write(none, sounds < 3 ? "Clap three times or more, at different places in the room" : "Nothing wrong was found");
+      find("set-up-blind-spots").replaceChildren(...blindSpots.map(blindSpotItem));
     } catch (error) {
       console.warn("livessl:", error.message);
     }

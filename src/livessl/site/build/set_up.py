@@ -7,7 +7,8 @@ from typing import Final
 
 import numpy as np
 
-from livessl.core.commission.blind_spots import BlindSpot, blind_spots
+from livessl.core.commission.blind_spot import BlindSpot
+from livessl.core.commission.blind_spots import blind_spots
 from livessl.core.commission.diagnosis import verify
 from livessl.core.commission.finding import Finding
 from livessl.core.commission.findings import channel_findings, find_faults, set_up_findings, sharp_delays, stds_s
@@ -60,7 +61,10 @@ def find_set_up_faults(site: Site, sounds: Sequence[Sequence[Observation]]) -> l
 
 
 def hidden_by(site: Site, sounds: Sequence[Sequence[Observation]]) -> tuple[BlindSpot, ...]:
-    """Return the faults of poses that the observations of some sounds could not have shown."""
+    """Return the faults of poses that the observations of some sounds could not have shown.
+
+    Their sizes hold where the set-up is nearly as filed: where no finding is about the poses.
+    """
     microphones = {spec.name: spec.microphones_m for spec in site.processed}
     joint = [sound for sound in sounds if len(sound) > 1]
     delays = sharp_delays(microphones, joint, channel_findings(microphones, sounds))

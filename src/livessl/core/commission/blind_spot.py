@@ -1,0 +1,50 @@
+"""A fault of a pose that some sounds could not have shown, as a value."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+CURE: Final = "clap at places that you know, and run livessl calibrate verify"
+"""What shows a fault that sounds at unknown places hide."""
+
+MOST_SHIFT_M: Final = 1000.0
+"""Least shift, in metres, from which on no shift would show, so that no size is told."""
+
+MOST_TURN_DEG: Final = 180.0
+"""The same of turns, in degrees."""
+
+
+@dataclass(frozen=True, slots=True)
+class BlindSpot:
+    """A fault of a pose that some sounds would not show.
+
+    Parameters
+    ----------
+    fault : str
+        `moved` or `turned`.
+    arrays : tuple of str
+        The array; several if the same fault of each of them would be hidden alike.
+    least : float
+        Smallest shift, in metres, or turn, in degrees, that the sounds would show in nine of ten cases.
+    along : (3,) tuple of float
+        Unit vector of the shift, or of the axis of the turn.
+    """
+
+    fault: str
+    arrays: tuple[str, ...]
+    least: float
+    along: tuple[float, ...]
+
+    @property
+    def message(self) -> str:
+        """What the sounds cannot show, in one sentence without a full stop."""
+        names = " or ".join(repr(name) for name in self.arrays)
+        along = ", ".join(f"{x:.2f}" for x in self.along)
+        if self.fault == "turned":
+            size = f" by less than {self.least:.0f} degrees" if self.least < MOST_TURN_DEG else ""
+            how = f"turned{size} about ({along})"
+        else:
+            size = f" by less than {self.least:.1f} m" if self.least < MOST_SHIFT_M else ""
+            how = f"moved{size} along ({along})"
+        return f"these sounds cannot show whether {names} is {how}"
