@@ -232,12 +232,14 @@ def _answers(runs: Sequence[Json], key: str) -> Table:
         return found
 
     kinds = list(answers(runs[-1]))
-    rows = [(kind, *(_answer(answers(run)[kind]) for run in runs)) for kind in kinds]
+    rows = [(kind, *(_answer(answers(run).get(kind)) for run in runs)) for kind in kinds]
     return Table(("answer", *(_count(run, key) for run in runs)), rows)
 
 
-def _answer(times: Json) -> str:
+def _answer(times: Json | None) -> str:
     """Return the time of answers, and in brackets the processor time of hub and database meanwhile."""
+    if times is None:
+        return "–"
     processor = f" ({times['cpu_p95_ms']:.0f})" if times.get("cpu_p95_ms") is not None else ""
     return f"{times['p95_ms']:.0f}{processor}"
 
