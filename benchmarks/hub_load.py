@@ -1,13 +1,15 @@
 """Hubs under the load of many sites, simulated at the broker by the messages that their servers would send.
 
     python benchmarks/hub_load.py --sites 1 10 100 1000 --out results/hub
+    python benchmarks/hub_load.py --hour 1000 --out results/hub
     python benchmarks/hub_load.py --history 10000 100000 1000000 --out results/hub
     python benchmarks/hub_load.py --out results/hub --into docs/scaling.md
 
 A real NATS server, a real hub as a process, and PostgreSQL (`--sqlite`: an SQLite file instead). The sites publish an
 hour of messages (`--minutes`) as fast as the stream takes them: how fast the hub takes them in. Then they go on at the
 pace of real time: how long a message takes to the history, and after that how long answers of the API take meanwhile.
-All the time, each site reports on itself every 5 s, as real ones do. `--history` fills the database of a hub instead,
+All the time, each site reports on itself every 5 s, as real ones do. `--hour` has them send their hour at a multiple
+of its pace instead (`--times-real`), and shows how it goes in the course of it. `--history` fills the database of a hub
 and measures the answers. `--into` writes the tables of all that lies in `--out` into a page.
 """
 
@@ -18,14 +20,11 @@ import asyncio
 import json
 import sys
 import time
-from collections.abc import Callable, Coroutine, Iterator, Sequence
-from contextlib import ExitStack, asynccontextmanager
-from dataclasses import asdict, dataclass, field
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from functools import partial
-from itertools import chain, islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Final
 
 import nats
 
@@ -33,30 +32,15 @@ sys.path[:0] = [str(Path(__file__).parents[1] / "tests"), str(Path(__file__).par
 
 import machine
 from history import Times
-from history_rows import Rows, fill
+from hub_history import measure_history
+from hub_hour import Hour, measure_hour
 from hub_processes import World, measure_answers, running_hub_process
+from hub_publishing import CONNECTIONS, Progress, meanwhile, publish_at_once, publish_paced, report
 from hub_report import document, written_into
-from hub_sites import MESSAGES_PER_HOUR, MIN_PACE, SimulatedSite, hub_rows
-from livessl.clock import SystemClock
-from livessl.federation.archive import Archive
-from livessl.federation.storing import Delivery
+from hub_sites import SimulatedSite
 from livessl.server.api.encode import JsonObject
-from livessl.server.forwarding.link import REPORT_S, WINDOW
-from livessl.server.forwarding.stream import CONSUMER, HEALTH, MESSAGE_ID, STREAM, message_id, subject
-from postgresql import SETTINGS, running_postgresql
+from livessl.server.forwarding.stream import STREAM
 from processor_time import memory_mb
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
-
-    from nats.aio.client import Client
-    from nats.js import JetStreamContext
-
-CONNECTIONS: Final = 4
-"""Connections that all simulated sites share; real ones have one each."""
-
-LOOK_S: Final = 0.2
-"""Interval, in seconds, at which the stream is asked how far the hub is."""
 
 
 @dataclass(frozen=True)
@@ -67,112 +51,6 @@ class Demand:
     minutes: int
     paced_s: float
     patience_s: float
-
-
-# --- sites
-
-
-@dataclass
-class Progress:
-    """What the sites have published, and how far the hub is."""
-
-    stream: JetStreamContext
-    sent: dict[int, float] = field(default_factory=dict)
-    """When each message was handed to NATS, by its number in the stream."""
-    events: int = 0
-    lags_s: list[float] = field(default_factory=list)
-    """Ages of the oldest message that the hub has not taken in, at each look."""
-    most_waiting: int = 0
-    taken: int = 0
-    """Number of the last message in the stream before which the hub has taken in all."""
-
-    async def look(self) -> int:
-        """Ask the stream how many messages wait for the hub; return that."""
-        info = await self.stream.consumer_info(STREAM, CONSUMER)
-        waiting = int(info.num_pending or 0) + int(info.num_ack_pending or 0)
-        self.taken = int(info.ack_floor.stream_seq) if info.ack_floor else 0
-        oldest = self.sent.get(self.taken + 1) if waiting else None
-        self.lags_s.append(0.0 if oldest is None else time.perf_counter() - oldest)
-        self.most_waiting = max(self.most_waiting, waiting)
-        return waiting
-
-    async def watch(self, end: asyncio.Event) -> None:
-        """Look until the end."""
-        while not end.is_set():
-            await self.look()
-            await asyncio.sleep(LOOK_S)
-
-    async def drain(self, patience_s: float) -> bool:
-        """Return whether the hub has taken everything in within some seconds."""
-        until = time.perf_counter() + patience_s
-        while await self.look():
-            if time.perf_counter() > until:
-                return False
-            await asyncio.sleep(LOOK_S)
-        return True
-
-
-async def publish(progress: Progress, stream: JetStreamContext, window: Sequence[Delivery]) -> None:
-    """Publish some messages as a site's server does, and wait until the stream has acknowledged all."""
-    waiting, times = [], []
-    for site, kind, place, body in window:
-        times.append(time.perf_counter())
-        headers = {MESSAGE_ID: message_id(place), "Nats-Expected-Stream": STREAM}
-        waiting.append(await stream.publish_async(subject(site, kind), body, headers=headers))
-        progress.events += kind == "event"
-    for each, sent in zip(await asyncio.gather(*waiting), times, strict=True):
-        progress.sent[each.seq] = sent
-
-
-async def publish_at_once(
-    progress: Progress, stream: JetStreamContext, sites: Sequence[SimulatedSite], minutes: int
-) -> None:
-    """Publish the first minutes of some sites in windows, as fast as the stream acknowledges them."""
-    following = (message for _ in range(minutes) for site in sites for message in site.minute())
-    messages = chain((message for site in sites for message in site.begin()), following)
-    while window := list(islice(messages, WINDOW)):
-        await publish(progress, stream, window)
-
-
-async def publish_paced(progress: Progress, sites: Sequence[SimulatedSite], seconds: float) -> float:
-    """Publish at the pace of real time, site by site; return the messages of a second."""
-    rate = max(MIN_PACE, len(sites) * MESSAGES_PER_HOUR / 3600)
-    begun, count = time.perf_counter(), 0
-    messages = (message for number in range(10**9) for message in sites[number % len(sites)].minute())
-    while (passed := time.perf_counter() - begun) < seconds:
-        due = round(passed * rate) - count
-        if due > 0:
-            await publish(progress, progress.stream, list(islice(messages, due)))
-            count += due
-        await asyncio.sleep(0.01)
-    return rate
-
-
-async def report(client: Client, sites: Sequence[SimulatedSite], end: asyncio.Event) -> None:
-    """Publish the reports of all sites on themselves, evenly spread, until the end."""
-    begun, count = time.perf_counter(), 0
-    while not end.is_set():
-        due = int((time.perf_counter() - begun) / REPORT_S * len(sites))
-        for number in range(count, due):
-            site = sites[number % len(sites)]
-            await client.publish(subject(site.name, HEALTH), site.report())
-        count = due
-        await asyncio.sleep(0.02)
-
-
-@asynccontextmanager
-async def meanwhile(work: Callable[[asyncio.Event], Coroutine[None, None, None]]) -> AsyncIterator[None]:
-    """Do something while the context lasts; what fails in it fails here.
-
-    The event tells it to end: Python 3.11 may lose a cancellation of what waits for an answer of NATS.
-    """
-    end = asyncio.Event()
-    task = asyncio.create_task(work(end))
-    try:
-        yield
-    finally:
-        end.set()
-        await task
 
 
 async def measure_load(world: World, demand: Demand) -> JsonObject:
@@ -225,7 +103,7 @@ async def measure_paced(world: World, demand: Demand, progress: Progress, sites:
     async with meanwhile(progress.watch):
         rate = await publish_paced(progress, sites, demand.paced_s)
     after, passed_s = world.processor_s(), time.perf_counter() - begun
-    asking = asyncio.create_task(asyncio.to_thread(measure_answers, world.hub.url, demand.sites, demand.paced_s))
+    asking = asyncio.create_task(asyncio.to_thread(measure_answers, world, demand.sites, demand.paced_s))
     await publish_paced(progress, sites, demand.paced_s)
     return {
         "messages_per_s": rate,
@@ -236,55 +114,12 @@ async def measure_paced(world: World, demand: Demand, progress: Progress, sites:
     }
 
 
-# --- history
-
-
-def filled(place: str, count: int, first: int, sites: int) -> None:
-    """Fill the database of a hub with so many events more, and let it know all sites."""
-
-    def make(number: int, of: int) -> Rows:
-        return hub_rows(number, of, sites)
-
-    fill(place, count, first, make)
-    archive = Archive(place if "://" in place else Path(place), SystemClock())
-    try:
-        simulated = [SimulatedSite(number) for number in range(sites)]
-        known = [message for site in simulated for message in site.begin()]
-        for batch in (known[start : start + WINDOW] for start in range(0, len(known), WINDOW)):
-            taken = archive.take(batch, 0.0)
-            assert len(taken.done) == len(batch)
-        archive.note_reports({site.name: json.loads(site.report()) for site in simulated})
-    finally:
-        archive.close()
-
-
-def measure_history(
-    counts: Sequence[int], sites: int, seconds: float, folder: Path, sqlite: bool
-) -> Iterator[JsonObject]:
-    """Fill a hub's database step by step, and measure the answers of a hub at each."""
-    with ExitStack() as stack:
-        place = str(folder / "hub.sqlite")
-        if not sqlite:
-            place = stack.enter_context(running_postgresql({**SETTINGS, "shared_buffers": "128MB"})).url()
-        stored = 0
-        for count in sorted(counts):
-            filled(place, count - stored, stored, sites)
-            stored = count
-            with running_hub_process(folder, sqlite=sqlite, database=place) as world:
-                measure_answers(world.hub.url, sites, 0.0)  # the first look of each kind reads what no cache has
-                answers = measure_answers(world.hub.url, sites, seconds)
-                yield {
-                    "history": count,
-                    "sites": sites,
-                    "answers": answers,
-                    "hub_memory_mb": memory_mb(world.hub.process.pid, "VmHWM"),
-                }
-
-
 def main() -> int:
     """Run what was asked for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sites", type=int, nargs="+", default=[], help="numbers of sites, one run each")
+    parser.add_argument("--hour", type=int, nargs="+", default=[], help="numbers of sites whose hour is followed")
+    parser.add_argument("--times-real", type=float, default=10.0, help="how many times as fast (default: 10)")
     parser.add_argument("--history", type=int, nargs="+", default=[], help="numbers of stored events, one step each")
     parser.add_argument("--history-sites", type=int, default=1000, help="sites of these events (default: 1000)")
     parser.add_argument("--minutes", type=int, default=60, help="minutes that are published at once (default: 60)")
@@ -310,6 +145,13 @@ def main() -> int:
             running_hub_process(Path(name), arguments.sqlite) as world,
         ):
             keep(f"sites-{sites}", asyncio.run(measure_load(world, demand)))
+    for sites in arguments.hour:
+        hour = Hour(sites, arguments.minutes, arguments.times_real, arguments.patience)
+        with (
+            TemporaryDirectory(prefix="livessl-hub-") as name,
+            running_hub_process(Path(name), arguments.sqlite) as world,
+        ):
+            keep(f"hour-{sites}", asyncio.run(measure_hour(world, hour)))
     if arguments.history:
         with TemporaryDirectory(prefix="livessl-hub-") as name:
             steps = measure_history(

@@ -24,6 +24,10 @@ PARTS: Final = {"hub": "the hub", "database": "PostgreSQL", "nats": "NATS"}
 MANY: Final = 100_000_000
 """Stored events to which the fit of the answers is extended."""
 
+ANSWERS: Final = (
+    "95 % of the API's answers take at most, in ms (and in brackets the processor time of hub and database meanwhile)"
+)
+
 Json = dict[str, Any]
 
 
@@ -48,9 +52,10 @@ def document(folder: Path) -> str:
     ValueError
         If there is nothing.
     """
-    loads, histories = _read(folder, "sites"), _read(folder, "history")
-    if not loads and not histories:
-        raise ValueError(f"{folder}: expected files sites-N.json or history-N.json; measure with --sites or --history")
+    loads, hours, histories = _read(folder, "sites"), _read(folder, "hour"), _read(folder, "history")
+    if not (loads or hours or histories):
+        what = "expected files sites-N.json, hour-N.json or history-N.json; measure with --sites, --hour or --history"
+        raise ValueError(f"{folder}: {what}")
     blocks: list[Block] = []
     if loads:
         blocks += [_about(loads), _flood(loads), "Processor time and disk of that:", _costs(loads), *_limits(loads)]
@@ -58,11 +63,18 @@ def document(folder: Path) -> str:
         if paced:
             blocks += [f"At the pace of real time, or {MIN_PACE:.0f} messages a second if that is more:", _paced(paced)]
             blocks += [
-                "95 % of the API's answers take at most, in ms, at the pace of real time:",
+                f"{ANSWERS}, at the pace of real time:",
                 _answers(paced, "sites"),
             ]
+    for hour in hours:
+        blocks += _hour(hour)
     if histories:
-        blocks += [_about(histories), "95 % of the API's answers take at most, in ms:", _answers(histories, "history")]
+        blocks += [
+            _about(histories),
+            _stored(histories),
+            f"{ANSWERS}:",
+            _answers(histories, "history"),
+        ]
         blocks += _fit(histories)
     return as_markdown(blocks)
 
@@ -131,12 +143,57 @@ def _paced(loads: Sequence[Json]) -> Table:
         rows.append(
             (
                 *(f"{load['sites']}", f"{paced['messages_per_s']:.0f}", f"{load['sites'] / REPORT_S:.1f}"),
-                f"{lag['p50_ms'] / 1000:.2f}, {lag['p95_ms'] / 1000:.2f}, {lag['max_ms'] / 1000:.2f} s",
-                *(_number(100 * shares[name] if name in shares else None, 1, " % of a core") for name in PARTS),
+                _ages(lag),
+                *(_share(shares, name) for name in PARTS),
                 f"{load['hub_memory_mb']:.0f} MB",
             )
         )
     return Table(titles, rows)
+
+
+def _hour(run: Json) -> list[Block]:
+    """Return how it went when sites sent their hour at a multiple of its pace."""
+    messages, events, sites = run["messages"], run["events"], run["hour"]
+    days, taken = sites * run["minutes"] / 60 / 24, "all" if run["is_drained"] else "not all"
+    text = (
+        f"{run['minutes']} minutes of {sites} sites at {run['times_real']:g} times their pace: {messages} messages "
+        f"with {events} events in {run['took_s']:.0f} s, {taken} taken in at the end. "
+        f"The stream grew to {run['stream_bytes'] / 1e6:.0f} MB and the database by {run['database_bytes'] / 1e6:.0f} "
+        f"MB, which is {run['database_bytes'] / 1e6 / days:.1f} MB a day for a site."
+    )
+    titles = ("until minute", "messages /s", "age of the oldest that waits: median, 95 %, longest", "most that waited",
+              *PARTS.values(), "memory of the hub", "slowest kind of answer, 95 %")  # fmt: skip
+    rows = []
+    for part in run["parts"]:
+        slowest = max(part["answers"], key=lambda kind: float(part["answers"][kind]["p95_ms"]))
+        rows.append(
+            (
+                *(f"{part['until_minute']:g}", f"{part['messages_per_s']:.0f}", _ages(part["lag"])),
+                f"{part['most_waiting']}",
+                *(_share(part["processor_share"], name) for name in PARTS),
+                f"{part['hub_memory_mb']:.0f} MB",
+                f"{part['answers'][slowest]['p95_ms']:.0f} ms ({slowest})",
+            )
+        )
+    return [_about([run]), text, Table(titles, rows)]
+
+
+def _ages(lag: Json) -> str:
+    return f"{lag['p50_ms'] / 1000:.2f}, {lag['p95_ms'] / 1000:.2f}, {lag['max_ms'] / 1000:.2f} s"
+
+
+def _share(shares: Json, name: str) -> str:
+    return _number(100 * shares[name] if name in shares else None, 1, " % of a core")
+
+
+def _stored(runs: Sequence[Json]) -> str:
+    """Return what the largest history takes."""
+    run = runs[-1]
+    size, count = run["database_bytes"], run["history"]
+    return (
+        f"{count} events of {run['sites']} sites take {size / 1e9:.1f} GB, {size / count:.0f} bytes an event. They "
+        f"were made by the database itself; the last step took {run['filled_s']:.0f} s."
+    )
 
 
 def _limits(loads: Sequence[Json]) -> list[Block]:
@@ -172,8 +229,18 @@ def _answers(runs: Sequence[Json], key: str) -> Table:
         return found
 
     kinds = list(answers(runs[-1]))
-    rows = [(f"{run[key]}", *(f"{answers(run)[kind]['p95_ms']:.1f}" for kind in kinds)) for run in runs]
-    return Table(("stored events" if key == "history" else key, *kinds), rows)
+    rows = [(kind, *(_answer(answers(run)[kind]) for run in runs)) for kind in kinds]
+    return Table(("answer", *(_count(run, key) for run in runs)), rows)
+
+
+def _answer(times: Json) -> str:
+    """Return the time of answers, and in brackets the processor time of hub and database meanwhile."""
+    processor = f" ({times['cpu_p95_ms']:.0f})" if times.get("cpu_p95_ms") is not None else ""
+    return f"{times['p95_ms']:.0f}{processor}"
+
+
+def _count(run: Json, key: str) -> str:
+    return f"{run[key]} {'stored events' if key == 'history' else 'sites'}"
 
 
 def _fit(runs: Sequence[Json]) -> list[Block]:
@@ -182,10 +249,12 @@ def _fit(runs: Sequence[Json]) -> list[Block]:
         return []
     lines = []
     counts = [float(run["history"]) for run in runs]
-    for kind in runs[-1]["answers"]:
-        fit = Fit.power(counts, [run["answers"][kind]["p95_ms"] for run in runs])
+    for kind, times in runs[-1]["answers"].items():
+        measured = "p95_ms" if times.get("cpu_p95_ms") is None else "cpu_p95_ms"
+        fit = Fit.power(counts, [run["answers"][kind][measured] for run in runs])
         lines.append(f"{kind}: exponent {fit.exponent:.2f}, so {fit(MANY):.0f} ms at 10⁸ events")
-    return ["By a power law through these figures, which is a guess beyond the last of them:", tuple(lines)]
+    what = "By a power law through the processor times where they were measured, else through the times of answers"
+    return [f"{what}, which is a guess beyond the last of them:", tuple(lines)]
 
 
 def real_time_per_s(sites: int) -> float:

@@ -20,7 +20,7 @@ apt_get() {
     fi
 }
 
-if [ -n "$missing" ]; then
+install_missing() {
     echo "test: installing$missing" >&2
     # shellcheck disable=SC2086  # $missing is a list of words
     if ! { apt_get update && apt_get install -y --no-install-recommends $missing; }; then
@@ -29,17 +29,26 @@ if [ -n "$missing" ]; then
         echo "test: a sound card (the others). To run them, first:" >&2
         echo "test: sudo apt-get install$missing" >&2
     fi
-fi
+}
 
+if [ -n "$missing" ]; then
+    install_missing &
+    installing=$!
+    # Meanwhile pip downloads, unless it needs a package itself: then one after the other, as apt-get cannot run twice.
+    { command -v gcc && python3 -c 'import ensurepip'; } >/dev/null 2>&1 || wait "$installing"
+fi
 sh scripts/setup.sh dev
+[ -z "$missing" ] || wait "$installing"
 PATH="$PWD/.venv/bin:$PATH"
 export PATH
 set -x
 ruff check
 ruff format --check
-python -m livessl.server.compiling & # once, not in every worker; meanwhile:
+python -m livessl.server.compiling & # once, not in every worker
 compiling=$!
-mypy
+mypy & # needs one processor only, for a minute: the tests begin meanwhile
+typing=$!
 lint-imports
 wait "$compiling"
 pytest -n 4 --dist loadfile --no-loadscope-reorder "$@"
+wait "$typing" || { echo "test: mypy found errors, which stand before the tests' output or within it" >&2; exit 1; }

@@ -21,7 +21,7 @@ from livessl.server.event_log import EventLog
 from livessl.server.latency import Arrivals, Latency
 from livessl.server.set_up_watch import SetUpState
 from livessl.server.store import Store
-from livessl.server.zones.shapes import fixed_zones
+from livessl.server.zones.zone_map import fixed_zones
 from livessl.site.models import Site
 from small_site import Changes, site_of
 

@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[1]
 
 
 def release(*arguments: str, out: Path) -> subprocess.CompletedProcess[str]:
-    environment = os.environ | {"PYTHON": sys.executable, "OUT": str(out)}
+    environment = os.environ | {"PYTHON": sys.executable, "OUT": str(out), "PIP_NO_COMPILE": "1"}
     return subprocess.run(
         ["sh", "scripts/release", *arguments],
         cwd=ROOT,

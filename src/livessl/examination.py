@@ -60,7 +60,8 @@ def examine(
     site : Site, Path or str
         A site, or the path of a site file.
     recordings, sample_rate_hz
-        As in `livessl.locate`. Ten sounds from different places show most; three are the least.
+        As in `livessl.locate`. Use ten sounds from different places. With fewer than three, only the samples, the
+        clocks and the site file are examined.
 
     Raises
     ------
@@ -78,9 +79,9 @@ class Gathered:
     Parameters
     ----------
     events : tuple of Event
-        What was located, without what the arrays received of it.
+        The located events. Their `received` is empty: `sounds` holds what was observed in it.
     sounds : tuple of tuple of Observation
-        What the arrays observed of each sound.
+        The arrays' observations of each sound.
     findings : tuple of Finding
         Faults that show in the samples and in the clocks.
     """
@@ -121,15 +122,20 @@ def conclude(site: Site, gathered: Gathered) -> Examination:
     """Draw the conclusions from what was gathered."""
     findings = [*gathered.findings, *find_set_up_faults(site, gathered.sounds), *layout_findings(site)]
     told = in_order(with_inputs(site, _without_consequences(findings)))
+    # the size of a blind spot is computed from the filed set-up, so it needs one without known faults
     hidden = () if are_poses_in_doubt(told) else hidden_by(site, gathered.sounds)
     return Examination(tuple(told), len(gathered.sounds), hidden)
 
 
 def _without_consequences(findings: Sequence[Finding]) -> list[Finding]:
-    """Leave out what follows from another finding.
+    """Leave out findings that follow from another one.
 
-    That is whatever a silent channel shows, the noise of a loud channel, crosstalk of a channel with the signal of
-    another, and the poses where clocks differ so much that arrays receive different sounds at one time.
+    These are:
+
+    - whatever else a `dead` channel shows;
+    - `noisy` for a channel with a wrong `level` or `clipping`;
+    - `crosstalk` for a `duplicate` or `deaf` channel;
+    - faults of the set-up if there is a `clock` fault, because the arrays then receive different sounds at one time.
     """
     faults: dict[tuple[str | None, int | None], set[str]] = {}
     for one in findings:
@@ -145,7 +151,7 @@ def _without_consequences(findings: Sequence[Finding]) -> list[Finding]:
 
 
 def _of_clocks(site: Site, rises: Mapping[str, Rises]) -> Iterator[Finding]:
-    """Compare what the recordings by the clocks of the nodes, or of arrays without a node, show of the sounds."""
+    """Compare when sounds rise by each clock: one for each node, and one for each array without a node."""
     by_clock: dict[str, Rises] = {}
     for array, one in rises.items():
         by_clock.setdefault(site.node_of(array) or array, one)

@@ -60,6 +60,8 @@ __all__ = [
 ]
 
 VERSION: Final = 2
+"""Version of the format. Raise it with a change of the bytes that nodes and servers of the version before cannot read,
+for the sides then refuse each other. A new section of a mark needs no higher version: servers skip unknown ones."""
 
 MAX_FRAME_SAMPLES: Final = 19_200
 """Most samples of a frame: twice the 9 600 samples of 50 ms at 192 kHz."""

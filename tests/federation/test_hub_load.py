@@ -6,12 +6,14 @@ import asyncio
 import json
 from collections import Counter
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import psycopg
 import pytest
 from sqlalchemy import text
 
 from conftest import require
+from hub_history import check_stored, fill_by_sql
 from hub_load import Demand, measure_load
 from hub_processes import running_hub_process
 from hub_report import document, written_into
@@ -21,7 +23,11 @@ from livessl.federation.archive import Archive
 from livessl.federation.received import Report
 from livessl.federation.storing import Delivery
 from livessl.server.forwarding.stream import Place
+from livessl.server.history.query import Query
 from nats_servers import NATS_SERVER
+
+if TYPE_CHECKING:
+    from postgresql import PostgreSQL
 
 
 def test_simulated_site_sends_what_a_hub_takes_in(tmp_path: Path) -> None:
@@ -62,6 +68,38 @@ def test_rows_of_a_large_history_are_those_that_a_hub_stores(tmp_path: Path) -> 
             assert (values, json.loads(stored["body"])) == (list(row[1:-1]), json.loads(str(row[-1])))
         given = {(kind, name, number) for kind, name, _, number, *_ in made.tags}
         assert {(tag["kind"], tag["name"], tag["number"] + first) for tag in tags} == given
+    finally:
+        archive.close()
+
+
+def test_history_made_by_postgresql_is_that_of_a_hub(postgresql: PostgreSQL) -> None:
+    """Keys and indices are there afterwards, what is made is checked by `check_stored`, and a hub goes on from it."""
+    place = postgresql.url()
+
+    def described(db: psycopg.Connection[Any]) -> list[Any]:
+        schema = "schemaname = current_schema() AND tablename IN ('events', 'event_tags')"
+        indices = sorted(db.execute(f"SELECT indexname, indexdef FROM pg_indexes WHERE {schema}").fetchall())
+        keys = (
+            "SELECT conname FROM pg_constraint WHERE conrelid = 'events'::regclass AND contype <> 'n' ORDER BY conname"
+        )
+        return [indices, db.execute(keys).fetchall()]
+
+    archive = Archive(place, SystemClock())
+    try:
+        with psycopg.connect(place, autocommit=True) as db:
+            before = described(db)
+            fill_by_sql(place, 40, 0, sites=7)
+            fill_by_sql(place, 20, 40, sites=7)
+            assert described(db) == before
+            db.execute("UPDATE event_tags SET confidence = 2 WHERE number = 45 AND kind = 'site'")
+            with pytest.raises(ValueError, match="expected the tags"):
+                check_stored(db, 40, 20)
+        newest = archive.store.page(Query(site="site-0003", limit=1)).rows[0]
+        assert (newest.number, newest.event["id"]) == (60, "history-000000059")
+        site = SimulatedSite(3)
+        sent = [Delivery(site.name, "event", Place("box.1", 1), json.dumps({**newest.event, "id": "new"}).encode())]
+        assert archive.take(sent, 0.0).done == sent
+        assert archive.store.page(Query(site="site-0003", limit=1)).rows[0].number == 61
     finally:
         archive.close()
 
@@ -141,8 +179,34 @@ def test_answers_are_extended_by_what_they_follow(tmp_path: Path) -> None:
     for count in (10_000, 100_000, 1_000_000):
         times = {**TIMES, "p95_ms": 3.0 * (count / 10_000) ** 0.5}
         step = {**ABOUT, "history": count, "sites": 9, "answers": {"newest of all": times}}
+        step |= {"database_bytes": 2500 * count, "filled_s": 12.3}
         (tmp_path / f"history-{count}.json").write_text(json.dumps(step))
-    assert "newest of all: exponent 0.50, so 300 ms at 10⁸ events" in document(tmp_path)
+    said = document(tmp_path)
+    assert "newest of all: exponent 0.50, so 300 ms at 10⁸ events" in said
+    assert "1000000 events of 9 sites take 2.5 GB, 2500 bytes an event." in said
+
+
+def test_hour_of_sites_is_told_part_by_part(tmp_path: Path) -> None:
+    parts = [
+        {
+            "until_minute": 10.0 * number,
+            "messages_per_s": 530.0,
+            "lag": TIMES,
+            "most_waiting": 100 * number,
+            "processor_share": {"hub": 0.1 * number},
+            "hub_memory_mb": 90.0 + number,
+            "answers": {"all sites": TIMES, "metrics": {**TIMES, "p95_ms": 30.0 * number * number}},
+        }
+        for number in range(1, 7)
+    ]
+    found = {"hour": 1000, "minutes": 60, "times_real": 10.0, "messages": 191_000, "events": 60_000, "took_s": 361.2}
+    sizes = {"is_drained": True, "stream_bytes": 120_000_000, "database_bytes": 250_000_000}
+    (tmp_path / "hour-1000.json").write_text(json.dumps({**ABOUT, **found, **sizes, "parts": parts}))
+    said = document(tmp_path)
+    assert "191000 messages with 60000 events in 361 s, all taken in at the end" in said
+    assert "6.0 MB a day for a site" in said  # 250 MB in an hour of a thousand
+    assert "| 10 | 530 | 0.10, 0.20, 0.30 s | 100 | 10.0 % of a core | – | – | 91 MB | 200 ms (all sites) |" in said
+    assert "| 1080 ms (metrics) |" in said
 
 
 def test_tables_are_written_between_their_comments_only(tmp_path: Path) -> None:
@@ -150,5 +214,5 @@ def test_tables_are_written_between_their_comments_only(tmp_path: Path) -> None:
     assert written_into(page, "new\n") == page.replace("old\n", "\nnew\n\n")
     with pytest.raises(ValueError, match="add them where the tables belong"):
         written_into("before\n", "new\n")
-    with pytest.raises(ValueError, match="measure with --sites or --history"):
+    with pytest.raises(ValueError, match="measure with --sites, --hour or --history"):
         document(tmp_path)

@@ -1,4 +1,4 @@
-"""The protocol of audio devices: what a capture node needs of one, whichever library drives it."""
+"""The protocol of audio devices: what a capture node needs of a device, whichever library drives the device."""
 
 from __future__ import annotations
 

@@ -22,13 +22,14 @@ FIRST_BLOCK_S: Final = 1.5
 """Time in seconds in which a device that was opened must deliver its first block."""
 
 FIRST_BLOCK_OF_SERVER_S: Final = 4.0
-"""The same for a sound server, which may take 2 s to begin."""
+"""Time in seconds in which a sound server that was opened must deliver its first block; it may take 2 s to begin."""
 
 HUNG_S: Final = 2.0
 """Time in seconds without a sign of life after which a process with an open stream is killed."""
 
 SCAN_S: Final = 5.0
-"""The same while it looks for the device: a scan of all devices gives no sign of life and may take a second."""
+"""Time in seconds without a sign of life after which a process that looks for the device is killed: a scan of all
+devices gives no sign of life and may take a second."""
 
 LAGGING_S: Final = 5.0
 """Time without a block, in seconds, after which a stream is given up although the machine is too busy to run it."""

@@ -10,13 +10,13 @@ from livessl.clock import Clock
 from livessl.core.types import Block
 
 LAG_SHOWN_NS: Final = 5_000_000_000
-"""Time in ns for which a loss in the ring stays the problem of the device."""
+"""Time in ns for which blocks that were not read in time stay the problem of the device."""
 
 _log = logging.getLogger(__name__)
 
 
 class LossCount:
-    """Counts lost blocks of one device, however its process is restarted.
+    """Counts lost blocks of one device, also across restarts of the device's process.
 
     Parameters
     ----------
@@ -27,7 +27,7 @@ class LossCount:
     block_s : float
         Length of a block, in seconds.
     clock : Clock
-        Tells how long ago blocks were lost.
+        Measures how long ago blocks were lost.
 
     Attributes
     ----------
@@ -35,7 +35,7 @@ class LossCount:
         Blocks that were lost: those that the driver flagged, those that this process did not read in time, and one for
         each gap without a flag.
     overruns : int
-        Those of them that this process did not read in time.
+        Lost blocks that this process did not read in time.
     unflagged_gaps : int
         Gaps that no driver flagged.
     """
@@ -56,7 +56,7 @@ class LossCount:
         self._gaps = GapWatch(self._sample_rate_hz, self._block_s, HARDWARE if hardware else SOUND_SERVER)
 
     def is_after_gap(self, block: Block) -> bool:
-        """Return True if sound is missing before a block without a flag of the driver."""
+        """Return True if sound is missing before a block, and the driver has not flagged that."""
         if block.overflow:
             self._gaps.restart()
         gap_ns = self._gaps.push(block.first_index, block.stamp_ns)

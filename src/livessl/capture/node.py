@@ -28,7 +28,8 @@ from livessl.site.models import Site
 from livessl.site.node_models import NodeConfig
 
 DRAIN_NS: Final = 3_000_000_000
-"""Longest wait, in ns, for the last acknowledgement of a server that does not answer; one that answers has no limit."""
+"""Longest wait, in ns, for the last acknowledgement while the server does not answer. While it answers, the wait has no
+limit."""
 
 WAIT_NS: Final = 20_000_000
 """Interval, in ns, at which a waiting node serves its link."""
@@ -37,15 +38,16 @@ MAX_PENDING: Final = 400
 """Most unacknowledged messages of a replay that is faster than real time."""
 
 AHEAD_NS: Final = round((RECENT_S - 4.0) * 1e9)
-"""Longest lead of such a replay over its server, in ns of recorded time: requested frames are still remembered then."""
+"""Longest lead of a replay over its server, in ns of recorded time: within it the node still has the frames that the
+server may request."""
 
 END_NS: Final = 1_000_000_000
 """Recorded time, in ns, at the end of a replay that need not be settled. It exceeds the pre-roll of a next sound, which
-is never settled; once only this much is left, every event has been published."""
+is never settled. Once no more than this is left, every event has been published."""
 
 STUCK_NS: Final = 3_000_000_000
 """Time, in ns, after which a replay goes on although nothing has settled since the server received everything: an array
-is silent, or a sound lasts on. A busy server needs a part of it to process what it has received."""
+is silent, or a sound lasts on. It leaves a busy server time to process what it has received."""
 
 _log = logging.getLogger(__name__)
 
@@ -69,8 +71,8 @@ def capture_device(
 ) -> None:
     """Run a node on its audio device until `stop()`, through any interruption of device or server.
 
-    `service`, if there is one, gets a report with each block: the node is ready when its device delivers, or when it
-    waits for it.
+    `service`, if there is one, gets a report with each block: the node is ready when its device delivers, or when the
+    node waits for its device.
     """
     config: NodeConfig = site.nodes[name]
     pipeline = make_pipeline(site, config.arrays, device.sample_rate_hz, reports_levels=True)
@@ -169,7 +171,7 @@ def send_session(
     DeviceError
         If recordings of arrays that the site joins do not belong together.
     UndeliveredError
-        If no server answers, or it refuses the sound, or has not acknowledged everything.
+        If no server answers, or the server refuses the sound or has not acknowledged everything.
     """
     pipelines, inputs = make_pipelines(site, recordings, reports_levels=True)
     link = _link(site, "replay", endpoint, pipelines, clock, run_id, Spool(), replay=True)
@@ -199,7 +201,7 @@ class _Lead:
         self._since_ns = clock.monotonic_ns()
 
     def exceeds(self, most_ns: int, end_ns: int) -> bool:
-        """Return True if the server has yet to settle more than `most_ns` before `end_ns`, and makes progress."""
+        """Return True if more than `most_ns` before `end_ns` is not settled, and the server still makes progress."""
         if self._link.settled != self._settled or self._link.pending:
             self._settled, self._since_ns = self._link.settled, self._clock.monotonic_ns()
         if self._settled is None or end_ns - self._settled * FRAME_NS <= most_ns:

@@ -1,4 +1,4 @@
-"""A node's messages on their way to the server: which go next, and which the server may not have. It knows no socket.
+"""A node's messages on their way to the server: which go next, and which the server may lack. It knows no socket.
 
 A frame is in one of these places, and always in the spool until the server needs it no more:
 
@@ -22,17 +22,18 @@ from livessl.capture.spool import Kept, Spool, SpoolError
 from livessl.core.types import Frame, Mark, Message
 
 BACKLOG_FRAMES: Final = 16
-"""Most frames of the backlog on their way at a time. Live sound may have to wait behind them: 0.25 s at 3 MB/s."""
+"""Most frames of the backlog that are sent and not yet acknowledged. Live sound may have to wait behind them: 0.25 s at
+3 MB/s."""
 
 BACKLOG_TIMEOUT_NS: Final = 2_000_000_000
-"""Wait for an acknowledgement of the backlog, in ns. After that the server is taken to have these frames, or not to
-want them, and more are sent."""
+"""Longest wait for an acknowledgement of the backlog, in ns. Frames that are not acknowledged by then are taken to have
+arrived, or not to be wanted, and further ones are sent."""
 
 LATE_NS: Final = 5_000_000_000
-"""Live sound that has waited so long to be sent, in ns, joins the backlog, so that newer sound can go first."""
+"""Time, in ns, after which live sound that waits to be sent joins the backlog, so that newer sound can go first."""
 
 MAX_REQUESTED: Final = 500
-"""Most requested frames that wait to be sent: a quarter of a minute of two arrays. Older ones come too late to matter
+"""Most requested frames that wait to be sent: those of two arrays for 12.5 s. Older ones would come too late to matter
 and are dropped."""
 
 _log = logging.getLogger(__name__)
@@ -47,7 +48,7 @@ class Outbox:
     Parameters
     ----------
     spool : Spool
-        Holds the frames; those that it holds already are the first backlog.
+        Holds the frames. Frames that are in the spool already are the first backlog.
     on_sent : callable or None
         Gets the array and the frame index of every frame that was handed over.
 
@@ -115,11 +116,11 @@ class Outbox:
         self._with_sections = allowed
 
     def add_requested(self, messages: Iterable[Message]) -> None:
-        """Queue the answer to a backfill request. It bypasses the spool: it is not sent again if it gets lost."""
+        """Queue the answer to a backfill request. It bypasses the spool, and if it gets lost it is not sent again."""
         self._requested.extend(messages)
 
     def acknowledge(self, received: Mapping[str, int], settled: int | None) -> None:
-        """Forget frames that the server has received, and release from the spool those that it needs no more."""
+        """Forget frames that the server has received; release those that the server needs no more from the spool."""
         self._received, self.settled = received, settled
         for array, last in received.items():
             if settled is not None:
@@ -128,12 +129,12 @@ class Outbox:
         self._backlog_sent = deque(kept for kept in self._backlog_sent if not self._is_received(kept))
 
     def reconnected(self, arrays: Collection[str]) -> None:
-        """Make the backlog all frames of `arrays` that the server has not received, in order of time."""
+        """Replace the backlog by all frames of `arrays` that the server has not received, in order of time."""
         frames = [kept for kept in self._spool.frames() if kept.array in arrays]
         self._backlog = deque(kept for kept in frames if not self._is_received(kept))
 
     def disconnected(self) -> None:
-        """Make everything in the spool backlog: whatever was on its way may be lost."""
+        """Replace the backlog by all frames in the spool: whatever was on its way may be lost."""
         self._received = {}
         self._keep_newest_marks(self._live)
         for queue in (self._live, self._live_sent, self._backlog_sent, self._requested):
@@ -206,7 +207,7 @@ class Outbox:
             self._drop(removed)
 
     def _drop(self, removed: Sequence[Kept]) -> None:
-        """Remove frames from all queues that the spool had no room for, and count those that the server never got."""
+        """Remove frames for which the spool had no room from all queues; count those that the server never got."""
         lost = [kept for kept in removed if not self._is_received(kept)]
         self._live = deque(waiting for waiting in self._live if waiting[1] not in lost)
         for kept in lost:

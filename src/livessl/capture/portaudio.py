@@ -1,7 +1,7 @@
 """Audio inputs through PortAudio: their list, the search by name, and the opening of one.
 
-Only this module imports `sounddevice`. The library is imported where it is used, so that everything else works on a
-machine without PortAudio. It runs in a process of its own (see `device_main`), without numpy.
+Only this module imports `sounddevice`. It does so where it uses the library, so that everything else works on a machine
+without PortAudio. The library runs in a process of its own (see `device_main`), without numpy.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ class InputDevice:
     default_sample_rate_hz : float
         The driver's default sampling rate, Hz.
     serial : str or None
-        Serial number of the USB device; None if it has none.
+        Serial number of the USB device; None if the device has none.
     usb_port : str or None
-        USB port, such as `usb-0000:00:14.0-2`; None if it is not on USB.
+        USB port, such as `usb-0000:00:14.0-2`; None if the device is not on USB.
     """
 
     name: str
@@ -116,7 +116,7 @@ def input_devices() -> list[InputDevice]:
 
 
 def find_input(wanted: Wanted) -> InputDevice | None:
-    """Return the input that a stream of that device would be opened on; None if there is none, or several."""
+    """Return the input on which a stream of `wanted` would be opened; None if no input matches, or several do."""
     try:
         return _find(_inputs(library()), wanted)[1]
     except OpeningError:
@@ -124,7 +124,7 @@ def find_input(wanted: Wanted) -> InputDevice | None:
 
 
 def rescan(sd: Any) -> None:
-    """Restart PortAudio: only then does it detect devices that were connected after its start.
+    """Restart PortAudio, which only detects devices that were connected before it started.
 
     Raises
     ------
@@ -163,7 +163,7 @@ def open_stream(sd: Any, wanted: Wanted, callback: Callable[[InputDevice], Calla
     Raises
     ------
     OpeningError
-        If that is not possible now.
+        If the stream cannot be opened now.
     """
     stream: Any = None
     index = -1

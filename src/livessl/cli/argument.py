@@ -24,6 +24,16 @@ MAX_RT60_S: Final = 5.0
 The number of image sources grows with its cube: a longer one would take hours, and few rooms reverberate longer."""
 
 
+MOST_COUNT: Final = 1_000_000_000
+"""Largest count that is understood; a larger one is a slip."""
+
+MOST_SEED: Final = 2**63 - 1
+"""Largest random seed."""
+
+RATES_HZ: Final = (100.0, 1e6)
+"""Lowest and highest sampling rate, in hertz, that recorders have."""
+
+
 def assignment(text: str) -> tuple[str, tuple[Path, ...]]:
     """Return the array name and the paths of `ARRAY=FILE` or `ARRAY=FILE,FILE,…`.
 
@@ -82,16 +92,14 @@ def key(text: str) -> bytes:
 
 def time(text: str) -> int:
     """Return an RFC 3339 time as nanoseconds UTC."""
-    from livessl.clock import utc_ns
+    from livessl.clock import recordable_ns
 
-    return _read(text, utc_ns)
+    return _read(text, recordable_ns)
 
 
 def positive(text: str) -> int:
     """Return a whole number >= 1."""
-    if not text.isdigit() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"expected a whole number >= 1, got {text!r}")
-    return int(text)
+    return _or_complain(_whole(text, MOST_COUNT) or None, text, "a whole number >= 1")
 
 
 def place(text: str) -> tuple[float, float, float]:
@@ -105,7 +113,23 @@ def place(text: str) -> tuple[float, float, float]:
 
 def count(text: str) -> int:
     """Return a whole number >= 0."""
-    return int(_number(text, lambda value: value >= 0 and value.is_integer(), "a whole number >= 0"))
+    return _or_complain(_whole(text, MOST_COUNT), text, "a whole number >= 0")
+
+
+def seed(text: str) -> int:
+    """Return a random seed, which numpy wants to be 0 or more."""
+    return _or_complain(_whole(text, MOST_SEED), text, f"a seed from 0 to {MOST_SEED}")
+
+
+def sample_rate(text: str) -> float:
+    """Return a sampling rate in hertz, within `RATES_HZ`."""
+    low, high = RATES_HZ
+    return _number(text, lambda value: low <= value <= high, f"a sampling rate from {low:g} to {high:,.0f} Hz")
+
+
+def probability(text: str) -> float:
+    """Return a number from 0 to 1."""
+    return _number(text, lambda value: 0 <= value <= 1, "a number from 0 to 1")
 
 
 def rt60(text: str) -> float:
@@ -135,11 +159,30 @@ def _read(text: str, read: Callable[[str], T]) -> T:
         raise argparse.ArgumentTypeError(str(error)) from error
 
 
+def _whole(text: str, most: int) -> int | None:
+    """Return a whole number from 0 to `most`; None for any other text."""
+    digits = text.lstrip("0") or text[:1]  # Python refuses to read thousands of digits
+    is_number = text.isascii() and text.isdigit() and len(digits) <= len(str(most))
+    return int(digits) if is_number and int(digits) <= most else None
+
+
+def _or_complain(value: int | None, text: str, expected: str) -> int:
+    if value is None:
+        raise argparse.ArgumentTypeError(f"expected {expected}, got {_shown(text)}")
+    return value
+
+
+def _shown(text: str) -> str:
+    """Return a text as an error shows it: a very long one is cut."""
+    longest = 40
+    return repr(text) if len(text) <= longest else f"{text[:longest]!r}…"
+
+
 def _number(text: str, valid: Callable[[float], bool], expected: str) -> float:
     try:
         value = float(text)
     except ValueError:
         value = float("nan")
     if not (valid(value) and value < float("inf")):
-        raise argparse.ArgumentTypeError(f"expected {expected}, got {text!r}")
+        raise argparse.ArgumentTypeError(f"expected {expected}, got {_shown(text)}")
     return value

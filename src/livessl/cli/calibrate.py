@@ -71,7 +71,8 @@ def _add_poses(actions: Any) -> None:
         "poses --site site.yaml --at 2,3,1.2 --at 6,8,1.2 … --write",
     )
     _add_places(
-        sub, "place of a clap in metres; repeat for each. With a running server, omit --at and places are proposed"
+        sub,
+        "place of a clap in metres; repeat for each clap. With a running server --at is optional: places are proposed",
     )
     sub.add_argument(
         "--place-std",
@@ -127,7 +128,7 @@ def _action(actions: Any, name: str, act: Callable[[argparse.Namespace], int], t
         epilog=f"example: livessl calibrate {example}",
     )
     sub.set_defaults(act=act)
-    add_recordings(sub)
+    add_recordings(sub, "site file (default: the session's own); without recordings, its running server is used")
     add_server(sub, "the command prompts for each clap and waits for it")
     sub.add_argument(
         "--wait",

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 from livessl.cli.options import BESIDE_THE_SITE
 from livessl.cli.output import complain
@@ -73,6 +73,7 @@ def tell_server(arguments: argparse.Namespace, url: str | None, path: Path) -> N
     path : Path
         The file.
     """
+    from livessl.server.api.set_up_schema import Changed
     from livessl.site.calibration_file import read_calibration
 
     later = "it takes effect when the server starts, or by Set-up on its dashboard"
@@ -80,23 +81,21 @@ def tell_server(arguments: argparse.Namespace, url: str | None, path: Path) -> N
         complain(f"no address of a running server is known; {later}", kind="note")
         return
     try:
-        answer = order(url, "set-up/reload", arguments.token_file, {}, TAKE_OVER_S)
+        answer = order(Changed, url, "set-up/reload", arguments.token_file, {}, TAKE_OVER_S)
     except RunError as error:
         complain(f"{error}; {later}", kind="note")
         return
     written = {name: array.microphones_m for name, array in read_calibration(path).arrays.items()}
     elsewhere = [
-        name for name, array in answer["arrays"].items() if name in written and not _same(array, written[name])
+        name
+        for name, array in answer.arrays.items()
+        if name in written and array.microphones_m != [list(at_m) for at_m in written[name]]
     ]
     if elsewhere:
-        file = answer["calibration"]["file"]
+        file = answer.calibration.file
         complain(f"the server at {url} has other poses: its file is {file} beside its own site file; copy it there")
-    elif answer["changed"]:
-        complain(f"the server at {url} has taken over {', '.join(answer['changed'])}", kind="note")
-
-
-def _same(array: dict[str, Any], microphones_m: Sequence[Sequence[float]]) -> bool:
-    return bool([list(at_m) for at_m in microphones_m] == array["microphones_m"])
+    elif answer.changed:
+        complain(f"the server at {url} has taken over {', '.join(answer.changed)}", kind="note")
 
 
 def undo(arguments: argparse.Namespace) -> Path:

@@ -12,7 +12,7 @@ from livessl.cli import progress
 from livessl.cli.exits import FAILED, OK
 from livessl.cli.options import add_joint, add_json, add_wav, joints, read_site, wavs
 from livessl.cli.output import complain, print_warnings
-from livessl.cli.server_answers import add_server, ask
+from livessl.cli.server_answers import add_server, ask_for
 from livessl.errors import UseError
 
 if TYPE_CHECKING:
@@ -30,9 +30,9 @@ def add_arguments(parser: Any) -> None:
     add_json(parser, "print one JSON object per finding")
 
 
-def add_recordings(parser: Any) -> None:
-    """Add --site, --session, --wav, --channels and --joint, which `recordings_given` reads."""
-    parser.add_argument("--site", type=Path, help="site file (default: the session's own)")
+def add_recordings(parser: Any, site: str = "site file (default: the session's own)") -> None:
+    """Add --site with a help text, --session, --wav, --channels and --joint, which `recordings_given` reads."""
+    parser.add_argument("--site", type=Path, help=site)
     parser.add_argument(
         "--session", action="append", type=Path, default=[], metavar="DIR", help="recorded session; repeatable"
     )
@@ -74,24 +74,16 @@ def _examine(arguments: argparse.Namespace) -> Examination:
 def _ask(url: str, token_file: Path | None) -> Examination:
     """Return what a running server has found."""
     from livessl.core.commission.blind_spot import BlindSpot
-    from livessl.core.commission.finding import Finding, Severity
+    from livessl.core.commission.finding import Finding
     from livessl.examination import Examination
+    from livessl.schema.answers import Findings
 
-    answer = ask(url, "findings", token_file)
-    for finding in answer["findings"]:
-        del finding["kind"]
-        finding["severity"] = Severity(finding["severity"])
-    findings = tuple(Finding(**finding) for finding in answer["findings"])
+    answer = ask_for(Findings, url, "findings", token_file)
+    findings = tuple(Finding(**one.model_dump(exclude={"kind"})) for one in answer.findings)
     blind_spots = tuple(
-        BlindSpot(
-            spot["fault"],
-            tuple(spot["arrays"]),
-            spot["least_deg"] if spot["least_m"] is None else spot["least_m"],
-            tuple(spot["along"]),
-        )
-        for spot in answer["blind_spots"]
+        BlindSpot(one.fault, tuple(one.arrays), one.least, tuple(one.along)) for one in answer.blind_spots
     )
-    return Examination(findings, answer["sounds"], blind_spots)
+    return Examination(findings, answer.sounds, blind_spots)
 
 
 def recordings_given(

@@ -22,6 +22,9 @@ SIZES: Final = {
 COUNTED: Final = ("line", "circle")
 """Kinds of arrays with any number of microphones."""
 
+MOST_ARRAYS: Final = 64
+"""Most arrays of a site that is drafted: each is checked beside all others, and more are written by a script."""
+
 _ARRAY: Final = re.compile(r"(?P<name>[^=]+)=(?P<kind>[a-z]+)(:(?P<size>[^@x]+)(x(?P<count>[0-9]+))?)?(?P<pose>@.*)?")
 _EXPECTED: Final = "expected NAME=KIND:SIZE@X,Y,Z@YAW, such as north=tetrahedron:0.5@4,2.5,1.5@90, got"
 
@@ -57,6 +60,14 @@ def array(text: str) -> ArrayWish:
         argument.place(place) if place else None,
         finite(yaw) if yaw else None,
     )
+
+
+def array_count(text: str) -> int:
+    """Return a number of arrays, 1 to `MOST_ARRAYS`."""
+    count = argument.positive(text)
+    if count > MOST_ARRAYS:
+        raise argparse.ArgumentTypeError(f"expected 1 to {MOST_ARRAYS} arrays, got {count}")
+    return count
 
 
 def name(text: str) -> str:

@@ -35,8 +35,8 @@ def add_arguments(parser: Any) -> None:
     add(
         "experiment",
         choices=[*sorted(EXPERIMENTS), LOCALIZER, REPORT],
-        help=f"experiment of the paper; {LOCALIZER} compares the methods onset and srp-phat; {REPORT} only reports on "
-        "the folders of --with",
+        help=f"experiment of the paper; {LOCALIZER} compares the methods onset and srp-phat; {REPORT} runs nothing: it "
+        "reports on the folders of --with",
     )
     add("--site", type=Path, help="site file whose room and arrays replace the paper's; for one-array and diversity")
     add("--events", type=Path, metavar="DIR", help="folder of sounds to play, named like doorslam001.wav")
@@ -62,13 +62,13 @@ def _add_simulation(group: Any) -> None:
     add = group.add_argument
     add("--positions", type=argument.positive, metavar="N", help="source positions (default: as many as in the paper)")
     add("--rt", metavar="S,S,…", help="reverberation times in seconds, such as 0,0.4, or a range such as 0:2:0.2")
-    add("--seed", type=int, default=0, help="random seed; the same seed gives the same results (default 0)")
+    add("--seed", type=argument.seed, default=0, help="random seed; the same seed gives the same results (default 0)")
     add("--classes", default=",".join(CLASSES), help=f"classes of sounds (default {','.join(CLASSES)})")
     add(
         "--snr",
         metavar="DB[,DB…]",
-        help="signal-to-noise ratio: white sensor noise this far below each recording's mean power; inf for no noise "
-        f"(default: no noise); only {LOCALIZER} takes several",
+        help="signal-to-noise ratio: white sensor noise, this many dB below each recording's mean power; inf for no "
+        f"noise (default: no noise); only {LOCALIZER} takes several",
     )
     add("--sample-rate", type=argument.positive, default=16000, metavar="HZ", help="sampling rate (default 16000)")
 

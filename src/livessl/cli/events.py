@@ -35,8 +35,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"messages to print: {', '.join(KINDS)} (default: event)",
     )
     add("--zone", help="print only what is inside this zone")
-    add("--min-confidence", type=float, metavar="C", help="least confidence of events and updates, 0 to 1")
-    add("--track", type=argument.count, metavar="N", help="print no tracks but number N")
+    add(
+        "--min-confidence",
+        type=argument.probability,
+        metavar="C",
+        help="print only events and updates of at least this confidence, 0 to 1",
+    )
+    add("--track", type=argument.count, metavar="N", help="of all tracks, print only number N")
     add(
         "--max-rate",
         type=argument.above_zero,

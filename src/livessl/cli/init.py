@@ -26,7 +26,7 @@ def add_arguments(parser: Any) -> None:
         help=f"array to add. KIND: {', '.join(SIZE_M)}; SIZE: edge, spacing or radius in metres; X,Y,Z: centre; YAW in "
         "degrees; repeatable",
     )
-    parser.add_argument("--arrays", type=argument.positive, metavar="N", help="number of arrays (default 2)")
+    parser.add_argument("--arrays", type=draft_arguments.array_count, metavar="N", help="number of arrays (default 2)")
     parser.add_argument(
         "--interface",
         action="append",
@@ -34,7 +34,7 @@ def add_arguments(parser: Any) -> None:
         metavar="NAME",
         help="audio interface, given by a part of its name; repeatable, and each gets its own node",
     )
-    parser.add_argument("--rate", type=argument.above_zero, metavar="HZ", help="sampling rate (default: by interface)")
+    parser.add_argument("--rate", type=argument.sample_rate, metavar="HZ", help="sampling rate (default: by interface)")
     parser.add_argument(
         "--channels",
         action="append",

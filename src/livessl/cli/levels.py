@@ -16,7 +16,9 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: Any) -> None:
     """Describe the command's arguments."""
-    parser.add_argument("--device", metavar="NAME", help="name, or part of it, as `livessl devices` prints it")
+    parser.add_argument(
+        "--device", metavar="NAME", help="name of the device as `livessl devices` prints it, or a part of it"
+    )
     parser.add_argument("--site", type=Path, help="site file; meters the device of the node given by --node")
     parser.add_argument("--node", help="name of the node in the site file")
     parser.add_argument("--wav", type=Path, metavar="FILE", help="meter a WAV or FLAC file instead of a device")
@@ -24,7 +26,7 @@ def add_arguments(parser: Any) -> None:
         "--inputs", type=argument.positive, metavar="N", help="number of inputs (default: all that the device has)"
     )
     parser.add_argument(
-        "--sample-rate", type=argument.above_zero, metavar="HZ", help="sampling rate with --device (default: its own)"
+        "--sample-rate", type=argument.sample_rate, metavar="HZ", help="sampling rate with --device (default: its own)"
     )
     parser.add_argument("--seconds", type=argument.above_zero, metavar="N", help="end after N s (default: at Ctrl-C)")
     parser.add_argument("--tap", action="store_true", help="report which microphone you tap")

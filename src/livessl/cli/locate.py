@@ -18,8 +18,8 @@ def add_arguments(parser: Any) -> None:
     add_site(parser)
     add_wav(
         parser,
-        "recording of an array, WAV or FLAC; repeat for each array. If the files do not begin at the same moment, set "
-        "wav_offset_s in the site file",
+        "recording of an array, WAV or FLAC; repeat for each array",
+        hint="If the recordings of the arrays do not begin at the same moment, set wav_offset_s in the site file",
         required=True,
     )
     add_method(parser)

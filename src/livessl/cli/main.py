@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import errno
 import os
 import sys
 from collections.abc import Sequence
@@ -41,7 +42,7 @@ class Command:
 COMMANDS: Final = (
     Command("demo", "locate sounds in a simulated room, without hardware", "livessl demo --once"),
     Command("serve", "run the fusion server with API and dashboard", "livessl serve --site site.yaml"),
-    Command("hub", "show the events of many sites together", "livessl hub --config hub.yaml"),
+    Command("hub", "run the hub, which collects the events of many sites", "livessl hub --config hub.yaml"),
     Command("events", "print live messages of a running server", "livessl events --zone door --json"),
     Command("capture", "run a capture node", "livessl capture --site site.yaml --node lab-pc"),
     Command(
@@ -68,7 +69,7 @@ COMMANDS: Final = (
     ),
     Command(
         "bench",
-        "measure how fast this machine locates, or how much load its server can carry",
+        "measure how fast this machine locates, or how much load a server on it carries",
         "livessl bench --live --arrays 64 --clients 20 --seconds 30",
     ),
     Command(
@@ -83,7 +84,7 @@ COMMANDS: Final = (
     ),
     Command(
         "calibrate",
-        "verify a set-up, and measure poses, by claps at places that you know",
+        "verify a set-up and measure poses, by claps at places that you know or, with refine, by any sounds",
         "livessl calibrate verify --session session/ --at 2,3,1.2 --at 6,8,1.2",
     ),
     Command(
@@ -132,11 +133,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # the program that reads our output, such as `head`, has ended
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return OK
-    except (RunError, OSError) as error:
+    except RunError as error:
         complain(str(error))
+        return FAILED
+    except OSError as error:
+        complain(_of_file(error))
         return FAILED
     except KeyboardInterrupt:
         return INTERRUPTED
+
+
+def _of_file(error: OSError) -> str:
+    """Return the file that an error is about, what is wrong with it and what to do."""
+    if error.filename is None or error.strerror is None:
+        return str(error)
+    full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+    return f"{error.filename}: {error.strerror}; {'free some space' if full else 'correct the path or its permissions'}"
 
 
 def _parser(given: Sequence[str]) -> argparse.ArgumentParser:

@@ -186,7 +186,7 @@ def _arrays(arguments: argparse.Namespace, questions: Questions, room: Draft) ->
     wishes: list[ArrayWish] = list(arguments.array)
     count = arguments.arrays or len(wishes)
     if not count:
-        count = questions.answer("Number of arrays", 2, argument.positive)
+        count = questions.answer("Number of arrays", 2, draft_arguments.array_count)
     if len(wishes) > count:
         what = f"expected at least the {len(wishes)} arrays of --array, got {count}; correct one of them"
         raise ConfigError([Fault("--arrays", what)])

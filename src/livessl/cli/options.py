@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from livessl.cli import argument
 from livessl.core.methods import METHODS
-from livessl.errors import ConfigError, Fault
+from livessl.errors import ConfigError, Fault, UseError
 
 if TYPE_CHECKING:
     from livessl.site.models import Site
@@ -26,13 +26,13 @@ def add_site(parser: Any) -> None:
     parser.add_argument("--site", type=Path, required=True, help="site file")
 
 
-def add_method(parser: Any) -> None:
-    """Add --method."""
+def add_method(parser: Any, default: str = "the site's") -> None:
+    """Add --method; `default` names the method without it."""
     parser.add_argument(
         "--method",
         type=argument.method,
         metavar=f"{{{','.join(sorted(METHODS))},MODULE:NAME}}",
-        help="localization method; MODULE:NAME imports one of your own (default: the site's)",
+        help=f"localization method; MODULE:NAME imports one of your own (default: {default})",
     )
 
 
@@ -77,15 +77,15 @@ def add_joint(parser: Any) -> None:
     )
 
 
-def add_wav(parser: Any, text: str, *, required: bool = False) -> None:
-    """Add --wav and --channels."""
+def add_wav(parser: Any, text: str, *, hint: str = "", required: bool = False) -> None:
+    """Add --wav and --channels; the help of --wav ends with the hint."""
     parser.add_argument(
         "--wav",
         action="append",
         type=argument.assignment,
         default=[],
         metavar="ARRAY=FILE[,FILE…]",
-        help=f"{text}; with several files, each is one channel of the array, in order",
+        help=f"{text}; with several files, each is one channel of the array, in order{hint and f'. {hint}'}",
         required=required,
     )
     parser.add_argument(
@@ -94,8 +94,23 @@ def add_wav(parser: Any, text: str, *, required: bool = False) -> None:
         type=argument.channels,
         default=[],
         metavar="ARRAY=1,2,3,4",
-        help="which channels of its files belong to ARRAY, counted from 1, in the site file's microphone order",
+        help="channels of ARRAY's files, in the order of its microphones in the site file, counted from 1",
     )
+
+
+def make_folder(path: Path, option: str) -> None:
+    """Make the folder that a command writes to, if there is none.
+
+    Raises
+    ------
+    UseError
+        If it cannot be made.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        what = "expected a folder, got a file" if isinstance(error, FileExistsError) else error.strerror or str(error)
+        raise UseError(f"{option} {path}: cannot be made: {what}; name another folder") from error
 
 
 def read_site(arguments: argparse.Namespace) -> Site:

@@ -9,7 +9,7 @@ from typing import Any
 
 from livessl.cli import argument, progress
 from livessl.cli.exits import OK, WRONG_USE
-from livessl.cli.options import add_json, add_site
+from livessl.cli.options import add_json, add_site, make_folder
 from livessl.cli.output import complain
 from livessl.lab.plan.defaults import CALIBRATION_M
 
@@ -28,14 +28,15 @@ def add_arguments(parser: Any) -> None:
         "--height",
         type=argument.not_negative,
         metavar="M",
-        help="height of the sounds, metres (default 1.5, or the middle of the search volume if that ends below 1.5 m)",
+        help="height of the sounds, metres (default 1.5, or the middle of a search volume that ends below 1.5 m)",
     )
     parser.add_argument(
         "--calibration",
         type=argument.above_zero,
         default=CALIBRATION_M,
         metavar="M",
-        help=f"standard deviation of the microphone positions, metres (default {CALIBRATION_M:g})",
+        help="how exactly the positions of microphones are known, standard deviation in metres "
+        f"(default {CALIBRATION_M:g})",
     )
     add_json(parser, "print one JSON object")
     parser.add_argument("--out", type=Path, metavar="DIR", help="also write plan.json and plan.png to DIR")
@@ -49,6 +50,7 @@ def run(arguments: argparse.Namespace) -> int:
     site = load_site(arguments.site)
     if arguments.out is not None:
         figure.require_matplotlib()
+        make_folder(arguments.out, "--out")
     try:
         with progress.counted("trying positions", "array") as bar:
             plan = design.make_plan(site, arguments.rt60, arguments.height, arguments.calibration, bar)
@@ -57,7 +59,6 @@ def run(arguments: argparse.Namespace) -> int:
         return WRONG_USE
     result = words.as_json(plan)
     if arguments.out is not None:
-        arguments.out.mkdir(parents=True, exist_ok=True)
         (arguments.out / "plan.json").write_text(json.dumps(result, allow_nan=False) + "\n", encoding="utf-8")
         figure.draw(plan, arguments.out / "plan.png")
     print(json.dumps(result, allow_nan=False) if arguments.json else words.as_text(plan))

@@ -7,13 +7,37 @@ import urllib.error
 import urllib.request
 from http.client import HTTPException
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
-from livessl.client.address import open_url, redirection
+from livessl.client.address import check_url, open_url, redirection
 from livessl.errors import RunError, UseError
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
+
+M = TypeVar("M", bound="BaseModel")
 
 ANSWER_S: Final = 10.0
 """Longest wait for a server's answer, seconds."""
+
+
+class RefusedError(RunError):
+    """A server has refused a request.
+
+    Parameters
+    ----------
+    text : str
+        What it said, with the address.
+    status : int
+        Status of its answer.
+    reason : str
+        Its own words; empty if it gave none.
+    """
+
+    def __init__(self, text: str, status: int, reason: str) -> None:
+        super().__init__(text)
+        self.status = status
+        self.reason = reason
 
 
 def add_server(parser: Any, text: str) -> None:
@@ -30,20 +54,45 @@ def read_token(token_file: Path) -> str:
     Raises
     ------
     UseError
-        If the file cannot be read.
+        If the file cannot be read, or holds no token.
     """
     try:
-        return token_file.read_text(encoding="utf-8").strip()
+        token = token_file.read_text(encoding="utf-8").strip()
     except OSError as error:
         raise UseError(f"--token-file: cannot read {token_file}: {error.strerror}") from error
     except UnicodeDecodeError as error:
         raise UseError(f"--token-file: expected a token in {token_file}, got bytes that are no text") from error
+    if not (token and token.isascii() and token.isprintable()):
+        raise UseError(
+            f"--token-file: expected the line that `livessl keys token` printed in {token_file}, got another"
+        )
+    return token
 
 
 def ask(url: str, path: str, token_file: Path | None) -> Any:
-    """Return a server's answer to `GET /api/v1/PATH`, which is JSON: see `fetch`."""
+    """Return a server's answer to `GET /api/v1/PATH`, which is JSON: see `fetch`; any JSON will do."""
     address = _address(url, path)
-    return _decoded(address, fetch(address, token_file))
+    body = fetch(address, token_file)
+    try:
+        return json.loads(body)
+    except (ValueError, RecursionError) as error:
+        raise RunError(f"{address}: the answer is not JSON ({error}); check the address") from error
+
+
+def ask_for(model: type[M], url: str, path: str, token_file: Path | None) -> M:
+    """Return a server's answer to `GET /api/v1/PATH`.
+
+    Raises
+    ------
+    UseError
+        As `fetch`.
+    RunError
+        As `fetch`, and if the answer is not what `model` describes.
+    """
+    from livessl.client.reading import read_answer
+
+    address = _address(url, path)
+    return read_answer(model, fetch(address, token_file), address)
 
 
 def fetch(address: str, token_file: Path | None) -> bytes:
@@ -53,17 +102,21 @@ def fetch(address: str, token_file: Path | None) -> bytes:
     ------
     UseError
         If the address or the token's file cannot be used.
+    RefusedError
+        If the server refuses; with its reason.
     RunError
-        If the server does not answer, or refuses; with the server's reason.
+        If it does not answer.
     """
     return _answer(address, token_file, None, ANSWER_S)
 
 
-def order(url: str, path: str, token_file: Path | None, value: Any, wait_s: float = ANSWER_S) -> Any:
-    """Return a server's answer, which is JSON, to `POST /api/v1/PATH` with a value as JSON.
+def order(model: type[M], url: str, path: str, token_file: Path | None, value: Any, wait_s: float = ANSWER_S) -> M:
+    """Return a server's answer to `POST /api/v1/PATH` with a value as JSON.
 
     Parameters
     ----------
+    model : type
+        Model of the answer.
     url, path : str
     token_file : Path or None
         File that holds a token.
@@ -74,26 +127,28 @@ def order(url: str, path: str, token_file: Path | None, value: Any, wait_s: floa
     Raises
     ------
     UseError, RunError
-        See `fetch`.
+        See `ask_for`.
     """
+    from livessl.client.reading import read_answer
+
     address = _address(url, path)
-    return _decoded(address, _answer(address, token_file, json.dumps(value).encode(), wait_s))
+    return read_answer(model, _answer(address, token_file, json.dumps(value).encode(), wait_s), address)
+
+
+def check_address(url: str) -> None:
+    """Raise `UseError` unless --url names a server."""
+    try:
+        check_url(url)
+    except UseError as error:
+        raise UseError(f"--{error}") from error
 
 
 def _address(url: str, path: str) -> str:
+    check_address(url)
     return f"{url.rstrip('/')}/api/v1/{path}"
 
 
-def _decoded(address: str, body: bytes) -> Any:
-    try:
-        return json.loads(body)
-    except ValueError as error:
-        raise RunError(f"{address}: the answer is not JSON ({error}); check the address") from error
-
-
 def _answer(address: str, token_file: Path | None, body: bytes | None, wait_s: float) -> bytes:
-    if not address.startswith(("http://", "https://")):
-        raise UseError(f"--url: expected an address such as http://127.0.0.1:8000, got {address!r}")
     headers = {} if body is None else {"Content-Type": "application/json"}
     if token_file is not None:
         headers["Authorization"] = f"Bearer {read_token(token_file)}"
@@ -103,18 +158,20 @@ def _answer(address: str, token_file: Path | None, body: bytes | None, wait_s: f
             answer: bytes = response.read()
             return answer
     except urllib.error.HTTPError as error:
-        said = redirection(error) or _reason(error)
+        reason = _reason(error)
+        said = redirection(error) or (reason and f": {reason}")
         cure = "; give --token-file" if error.code in (401, 403) and token_file is None else ""
-        raise RunError(f"{address}: the server answered {error.code} {error.reason}{said}{cure}") from error
+        text = f"{address}: the server answered {error.code} {error.reason}{said}{cure}"
+        raise RefusedError(text, error.code, reason) from error
     except (OSError, ValueError, HTTPException) as error:
         why = getattr(error, "reason", error)
         raise RunError(f"{address}: no answer from a server ({why}); check that it runs and its address") from error
 
 
 def _reason(error: urllib.error.HTTPError) -> str:
-    """Return the reason that a server gives for a refusal, as the rest of a sentence; empty if it gives none."""
+    """Return the reason that a server gives for a refusal; empty if it gives none."""
     try:
         detail = json.load(error)["detail"]
+        return detail if isinstance(detail, str) else "; ".join(str(fault["msg"]) for fault in detail)
     except (OSError, ValueError, KeyError, TypeError):
         return ""
-    return f": {detail}" if isinstance(detail, str) else ""

@@ -5,16 +5,19 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from livessl.calibration import HeardSound
-from livessl.cli.server_answers import ask
+from livessl.cli.server_answers import ask_for
 from livessl.clock import SystemClock, utc_ns
 from livessl.core.types import Observation
-from livessl.errors import RunError
+from livessl.errors import ConfigError, RunError
+from livessl.schema import answers
+from livessl.server.api import set_up_schema
 from livessl.site.load import parse_site
 from livessl.site.models import Site
 
@@ -49,24 +52,31 @@ class ServerSounds:
         self._clock = SystemClock()
 
     def site(self) -> Site:
-        """Return the server's site as far as calibration needs it: room, arrays and speed of sound."""
-        answer = ask(self._url, "site", self._token_file)
-        described = {
-            "site": answer["site"],
-            "room": answer["room"],
-            "grid": {"bounds_m": answer["grid"]["bounds_m"], "spacing_m": answer["grid"]["spacing_m"]},
-            "speed_of_sound_m_s": answer["speed_of_sound_m_s"],
-            "band_hz": answer["band_hz"],
-            "arrays": {
-                name: {"microphones_m": array["microphones_m"], "band_hz": array["band_hz"]}
-                for name, array in answer["arrays"].items()
-            },
+        """Return the server's site as far as calibration needs it: room, arrays and speed of sound.
+
+        Raises
+        ------
+        UseError
+            If the address of the server cannot be used.
+        RunError
+            If there is no answer, or none that describes a site.
+        """
+        used = {
+            "site": True,
+            "room": True,
+            "grid": {"bounds_m", "spacing_m"},
+            "speed_of_sound_m_s": True,
+            "band_hz": True,
+            "arrays": {"__all__": {"microphones_m", "band_hz"}},
         }
-        return parse_site(json.dumps(described))
+        try:
+            return parse_site(json.dumps(self._described().model_dump(mode="json", include=used)))
+        except ConfigError as error:
+            raise RunError(f"{self._url}: cannot use the site of the server: {error}; check the address") from error
 
     def has_joint_arrays(self) -> bool:
         """Return whether the server joins arrays, so that `site` does not say how its site file names them."""
-        return bool(ask(self._url, "site", self._token_file)["joint"])
+        return bool(self._described().joint)
 
     def kept(self) -> list[HeardSound]:
         """Return the sounds that the server still keeps, the oldest first."""
@@ -105,24 +115,31 @@ class ServerSounds:
         )
 
     def _after(self, number: int) -> Answer:
-        answer = ask(self._url, f"sounds?after={number}", self._token_file)
-        sounds = [(utc_ns(one["time_utc"]), _sound(one)) for one in answer["sounds"]]
-        return Answer(utc_ns(answer["now_utc"]), answer["last"], sounds)
+        answer = ask_for(set_up_schema.HeardSounds, self._url, f"sounds?after={number}", self._token_file)
+        sounds = [(_ns(one.time_utc), _sound(one)) for one in answer.sounds]
+        return Answer(_ns(answer.now_utc), answer.last, sounds)
+
+    def _described(self) -> answers.Site:
+        return ask_for(answers.Site, self._url, "site", self._token_file)
 
 
-def _sound(one: dict[str, Any]) -> HeardSound:
-    position_m = None if one["position_m"] is None else np.array(one["position_m"], dtype=np.float64)
-    observations = tuple(_observation(each) for each in one["observations"])
-    return HeardSound(utc_ns(one["time_utc"]) / 1e9, position_m, one["status"], one["reason"], observations)
+def _ns(instant: datetime) -> int:
+    return utc_ns(instant.isoformat())
 
 
-def _observation(one: dict[str, Any]) -> Observation:
+def _sound(one: set_up_schema.HeardSound) -> HeardSound:
+    position_m = None if one.position_m is None else np.array(one.position_m, dtype=np.float64)
+    observations = tuple(_observation(each) for each in one.observations)
+    return HeardSound(_ns(one.time_utc) / 1e9, position_m, str(one.status), one.reason, observations)
+
+
+def _observation(one: set_up_schema.ObservedDelays) -> Observation:
     return Observation(
-        one["array"],
-        1e-6 * np.array([np.nan if delay is None else delay for delay in one["delays_us"]], dtype=np.float64),
-        np.array(one["inverted"], dtype=bool),
-        np.array(one["coherence"], dtype=np.float64),
-        np.array(one["powers"], dtype=np.float64),
-        one["sharpness"],
-        1e-6 * one["closure_us"],
+        one.array,
+        1e-6 * np.array([np.nan if delay is None else delay for delay in one.delays_us], dtype=np.float64),
+        np.array(one.inverted, dtype=bool),
+        np.array(one.coherence, dtype=np.float64),
+        np.array(one.powers, dtype=np.float64),
+        one.sharpness,
+        1e-6 * one.closure_us,
     )

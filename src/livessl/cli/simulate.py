@@ -9,7 +9,7 @@ from typing import Any
 
 from livessl.cli import argument, progress
 from livessl.cli.exits import OK, WRONG_USE
-from livessl.cli.options import add_site
+from livessl.cli.options import add_site, make_folder
 from livessl.cli.output import complain
 from livessl.errors import ConfigError, Fault
 
@@ -40,12 +40,12 @@ def add_arguments(parser: Any) -> None:
     parser.add_argument("--count", type=argument.positive, default=8, help="number of sounds in the scene (default 8)")
     parser.add_argument(
         "--sample-rate",
-        type=argument.positive,
+        type=argument.sample_rate,
         metavar="HZ",
         help="sampling rate of the recordings (default: that of each node's device in the site file, else 44100)",
     )
     parser.add_argument(
-        "--seed", type=int, default=0, help="random seed; the same seed gives the same session (default 0)"
+        "--seed", type=argument.seed, default=0, help="random seed; the same seed gives the same session (default 0)"
     )
 
 
@@ -72,6 +72,7 @@ def run(arguments: argparse.Namespace) -> int:
             sample_rate_hz=rate,
             seed=arguments.seed,
         )
+        make_folder(arguments.out, "--out")
         with progress.counted("simulating the room", "source") as bar:
             write_scene(arguments.out, site, scene, seed=arguments.seed, rates_hz=rates, progress=bar)
     except ValueError as error:

@@ -1,4 +1,4 @@
-"""`livessl support-bundle`: one file with what helps others to find a fault, without secrets and without sound."""
+"""`livessl support-bundle`: one file that shows others the state of a server; it has no secrets and no sound."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from livessl import __version__
 from livessl.cli.exits import OK
 from livessl.cli.options import add_json
 from livessl.cli.output import complain
-from livessl.cli.server_answers import add_server, ask, fetch
+from livessl.cli.server_answers import add_server, ask, check_address, fetch
 from livessl.clock import SystemClock, utc_text
-from livessl.errors import ConfigError, RunError
+from livessl.errors import ConfigError, RunError, UseError
 
 LINES: Final = 1000
 """Most lines of the server's log, and of the journal."""
@@ -38,24 +38,24 @@ ANSWERS: Final = {
     "rules.json": "alerts/rules",
     "log.json": f"log?limit={LINES}",
 }
-"""Parts of the bundle that a running server gives, by their path under /api/v1."""
+"""Parts of the bundle that a running server answers: the name of each, and its path under /api/v1."""
 
 
 @dataclass
 class Bundle:
-    """Parts of a bundle by their names, and why others are missing."""
+    """The parts of a bundle by name, and the reason for each part that is missing."""
 
     secrets: frozenset[str] = frozenset()
     parts: dict[str, bytes] = field(default_factory=dict)
     missing: dict[str, str] = field(default_factory=dict)
 
     def add(self, name: str, make: Callable[[], str]) -> None:
-        """Add a part without its secrets, or note why it cannot be had."""
+        """Add a part without its secrets, or note why it could not be made."""
         from livessl.site.redact import scrubbed
 
         try:
             text = make()
-        except (RunError, ConfigError, OSError, ValueError, subprocess.SubprocessError) as error:
+        except (RunError, UseError, OSError, ValueError, subprocess.SubprocessError) as error:
             self.missing[name] = scrubbed(str(error), self.secrets)
         else:
             self.parts[name] = scrubbed(text, self.secrets).encode()
@@ -71,6 +71,8 @@ def add_arguments(parser: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
+    if arguments.url is not None:
+        check_address(arguments.url)
     time_utc = utc_text(SystemClock().now_ns())
     stamp = time_utc.partition(".")[0].replace("-", "").replace(":", "")
     path = arguments.out or Path(f"livessl-support-{stamp}Z.zip")
@@ -97,13 +99,14 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _add_site(bundle: Bundle, path: Path) -> Any:
-    """Add the site file without secrets, and what `check` finds in it; return its data, None if it has none."""
+    """Add the site file without secrets, and what `check` finds in it; return its data, or None if it is not YAML."""
     import yaml
 
+    from livessl.site.findings import read_yaml
     from livessl.site.redact import redacted
 
     try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+        data = read_yaml(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError) as error:
         bundle.missing["site.yaml"] = f"{path} cannot be read as YAML ({type(error).__name__}); run `livessl check`"
         data = None
@@ -125,9 +128,9 @@ def _checked(path: Path) -> str:
 
 
 def _versions() -> dict[str, Any]:
-    """Return what runs where."""
+    """Return the versions of livessl, Python and all packages, and what machine this is."""
     found = ((one.metadata["Name"], one.version) for one in distributions())
-    packages = {name: version for name, version in found if name}  # what is left of an uninstalled one has no name
+    packages = {name: version for name, version in found if name}  # leftovers of an uninstalled package have no name
     return {
         "livessl": __version__,
         "python": sys.version,
@@ -169,7 +172,7 @@ def _journal() -> str:
     Raises
     ------
     RunError
-        If this machine has no journal of them.
+        If this machine has no journal, or its journal has no lines of these units.
     """
     program = shutil.which("journalctl")
     if program is None:

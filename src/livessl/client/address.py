@@ -64,7 +64,7 @@ class Address:
         UseError
             If the URL is none of HTTP, or the file with certificates cannot be used.
         """
-        _check(url)
+        check_url(url)
         if token is not None and not (token.isascii() and token.isprintable()):
             raise UseError("token: expected the text that `livessl keys token` printed, got other characters")
         secure = url.startswith("https://")
@@ -91,7 +91,7 @@ class Address:
         Raises
         ------
         UnreachableError
-            If there is none; `UnavailableError` if the server says that it has none now.
+            If no answer comes; `UnavailableError` if the server answers that it cannot serve the request now.
         RefusedError
             If the request is wrong.
         """
@@ -117,7 +117,7 @@ class Address:
         return "; give a token" if self.token is None else "; give a token that is valid and has the role"
 
     def lost(self, error: Exception) -> RunError:
-        """Return the error to raise for one of the connection: a wrong certificate or address does not mend itself."""
+        """Return the error to raise for an error of the connection: `RefusedError` if further attempts would fail."""
         reason = error.reason if isinstance(error, urllib.error.URLError) else error
         if isinstance(reason, ssl.SSLError) and reason.reason in _NO_TLS:
             return RefusedError(f"{self.url}: what answers does not speak TLS ({reason.reason}); try http://")
@@ -132,14 +132,14 @@ _NO_TLS: Final = frozenset({"WRONG_VERSION_NUMBER", "HTTP_REQUEST", "PACKET_LENG
 
 
 class _Unredirected(urllib.request.HTTPRedirectHandler):
-    """Makes an error of every redirect: urllib would send the token to whatever host it names."""
+    """Makes an error of every redirect: urllib would send the token to whatever host the redirect names."""
 
     def redirect_request(self, *_: Any) -> None:
         """Follow nothing."""
 
 
 def open_url(request: urllib.request.Request, wait_s: float, context: ssl.SSLContext | None = None) -> Any:
-    """Return the answer to a request, which is a context manager; a redirect is not followed but is an `HTTPError`."""
+    """Return the answer to a request as a context manager; a redirect is not followed, but raises `HTTPError`."""
     handlers: list[Any] = [_Unredirected()]
     if context is not None:
         handlers.append(urllib.request.HTTPSHandler(context=context))
@@ -147,7 +147,7 @@ def open_url(request: urllib.request.Request, wait_s: float, context: ssl.SSLCon
 
 
 def redirection(error: urllib.error.HTTPError) -> str:
-    """Return where an answer sends the client, and what to do, as the rest of a sentence; empty if it does not."""
+    """Return where a redirect leads, and what to do, as the rest of a sentence; empty if the answer is no redirect."""
     target = error.headers.get("Location") if 300 <= error.code < 400 else None
     return "" if target is None else f", a redirect to {target}; give that server's address if you trust it"
 
@@ -157,7 +157,7 @@ def may_pass(status: int) -> bool:
     return status >= 500 or status in TEMPORARY
 
 
-def _check(url: str) -> None:
+def check_url(url: str) -> None:
     """Raise `UseError` unless `url` names a server."""
     example = "url: expected an address such as http://127.0.0.1:8000"
     try:

@@ -25,7 +25,7 @@ def read_answer(model: type[M], body: str | bytes, path: str) -> M:
     Raises
     ------
     NewerServerError
-        If it is an object that this client cannot read.
+        If it is JSON that this client cannot read.
     ForeignAnswerError
         If it is not JSON.
     """
@@ -43,4 +43,4 @@ def unreadable(error: ValidationError, path: str) -> RunError:
         return ForeignAnswerError(f"{what}; check that the address is that of a livessl server")
     where = ".".join(str(part) for part in fault["loc"])
     what = f"{path}: cannot read the answer: {where}: {fault['msg']}"
-    return NewerServerError(f"{what}; update livessl, the server is newer")
+    return NewerServerError(f"{what}; update livessl if the server is newer, and check that the address is its own")

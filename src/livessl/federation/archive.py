@@ -16,8 +16,9 @@ from typing import Any, Final
 import orjson
 from sqlalchemy import Connection, bindparam, case, delete, insert, select, text, tuple_, update
 
-from livessl.clock import Clock, utc_ns, utc_text
+from livessl.clock import Clock, utc_ns
 from livessl.federation.gaps import Gaps
+from livessl.federation.overview import Contact, describe
 from livessl.federation.storing import Delivery, Taken, put, read
 from livessl.server.api.encode import JsonObject
 from livessl.server.forwarding.stream import first_number
@@ -27,9 +28,6 @@ from livessl.server.store import Store
 
 LOCK: Final = 0x11_7E_55_2
 """Number of the PostgreSQL lock of the hub that takes messages in, so that the others wait."""
-
-AWAY_S: Final = 30.0
-"""Silence, in seconds, after which a site counts as away; it reports on itself every 5 s."""
 
 _RAISE: Final = (
     update(received)
@@ -232,31 +230,30 @@ class Archive:
     # --- what is asked for
 
     def sites(self) -> list[JsonObject]:
-        """Return all sites, by name, with their condition and the time of their last contact."""
-        with self._database.reading() as connection:
-            rows = connection.execute(select(sites).order_by(sites.c.site)).all()
-            states: dict[str, dict[str, str]] = {row.site: {} for row in rows}
-            for row in connection.execute(select(arrays.c.site, arrays.c.body)):
-                array = orjson.loads(row.body)
-                states.setdefault(row.site, {})[array["name"]] = array["state"]
-        return [self._described(row, states[row.site]) for row in rows]
+        """Return all sites, by name, with their condition and the time of their last contact.
 
-    def _described(self, row: Any, states: Mapping[str, str]) -> JsonObject:
-        report = orjson.loads(row.report)
-        age_s = (self._clock.now_ns() - row.contact_ns) / 1e9
-        current = {**states, **report.get("arrays", {})}
-        return {
-            "site": row.site,
-            "status": _status(age_s, current),
-            "contact_utc": utc_text(row.contact_ns),
-            "age_s": round(max(0.0, age_s), 3),
-            "version": report.get("version"),
-            "location_deg": report.get("location_deg"),
-            "arrays": current,
-            "waiting": report.get("waiting", 0),
-            "missing": row.missing,
-            "newest_event_utc": utc_text(row.newest_ns) if row.newest_ns else None,
-        }
+        The states of a site's arrays are those of its last report, which names all of them; before the first one they
+        are those of the messages. So one row is read for each site, and not one for each array as well.
+        """
+        with self._database.reading() as connection:
+            contacts = self._contacts(connection)
+            silent = [contact.site for contact in contacts if not contact.states]
+            states = _array_states(connection, silent) if silent else {}
+        return [describe(contact, contact.states or states.get(contact.site, {})) for contact in contacts]
+
+    def contacts(self) -> list[Contact]:
+        """Return all sites, by name, without the messages about their arrays."""
+        with self._database.reading() as connection:
+            return self._contacts(connection)
+
+    def _contacts(self, connection: Connection) -> list[Contact]:
+        columns = sites.c.site, sites.c.contact_ns, sites.c.missing, sites.c.newest_ns, sites.c.report
+        rows = connection.execute(select(*columns).order_by(sites.c.site)).all()
+        now_ns = self._clock.now_ns()
+        return [
+            Contact(site, max(0.0, (now_ns - contact_ns) / 1e9), contact_ns, missing, newest_ns, orjson.loads(report))
+            for site, contact_ns, missing, newest_ns, report in rows
+        ]
 
     def event(self, site: str, event_id: str) -> JsonObject | None:
         """Return an event of a site, None if there is none of that id."""
@@ -318,9 +315,10 @@ def _locked(connection: Connection, places: set[tuple[str, str]]) -> dict[tuple[
     return last
 
 
-def _status(age_s: float, states: Mapping[str, str]) -> str:
-    """Return the condition of a site: `away` if nothing comes from it, else by its arrays as its own health has it."""
-    if age_s > AWAY_S:
-        return "away"
-    enabled = {state for state in states.values() if state != "disabled"}
-    return "ok" if enabled == {"healthy"} else "starting" if enabled <= {"starting", "healthy"} else "degraded"
+def _array_states(connection: Connection, names: Sequence[str]) -> dict[str, dict[str, str]]:
+    """Return the last state of each array by site and name, for the sites of these names."""
+    states: dict[str, dict[str, str]] = {}
+    for site, body in connection.execute(select(arrays.c.site, arrays.c.body).where(arrays.c.site.in_(names))):
+        array = orjson.loads(body)
+        states.setdefault(site, {})[array["name"]] = array["state"]
+    return states

@@ -8,9 +8,6 @@ from typing import Annotated, Any, Final
 
 import orjson
 from fastapi import APIRouter, Depends, HTTPException, Query, Request, Response
-from prometheus_client import CollectorRegistry, generate_latest
-from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
-from prometheus_client.registry import Collector
 
 from livessl import __version__
 from livessl.core.types import Status
@@ -20,7 +17,6 @@ from livessl.federation.intake import Intake
 from livessl.schema.answers import errors
 from livessl.server.api.auth import HEALTH
 from livessl.server.api.encode import API_VERSION, JsonObject
-from livessl.server.api.metrics import CONTENT_TYPE
 from livessl.server.api.paging import cached, page_answer, paged
 from livessl.server.api.queries import Time, instant, require_no_nul
 from livessl.server.api.routes import as_json
@@ -143,55 +139,3 @@ def _add_alerts(router: APIRouter, archive: Archive) -> None:
         found = archive.alerts(site, limit, before)
         following = found[-1][0] if len(found) == limit else None
         return as_json({"v": API_VERSION, "alerts": [alert for _, alert in found], "next_before": following})
-
-
-def metrics_route(archive: Archive, intake: Intake) -> APIRouter:
-    """`GET /metrics`."""
-    router, registry = APIRouter(), CollectorRegistry()
-    registry.register(_Metrics(archive, intake))
-
-    @router.get(
-        "/metrics",
-        tags=["state"],
-        response_class=Response,
-        responses={200: {"content": {"text/plain": {"schema": {"type": "string"}}}}, **errors(503)},
-    )
-    def get_metrics() -> Response:
-        """Metrics in the text format of Prometheus."""
-        return Response(generate_latest(registry), media_type=CONTENT_TYPE)
-
-    return router
-
-
-class _Metrics(Collector):
-    """Counts and states of the hub and its sites."""
-
-    def __init__(self, archive: Archive, intake: Intake) -> None:
-        self._archive = archive
-        self._intake = intake
-
-    def describe(self) -> list[Metric]:
-        """Promise nothing, so that registering asks no database."""
-        return []
-
-    def collect(self) -> list[Metric]:
-        intake = self._intake
-        site_up = GaugeMetricFamily("livessl_site_up", "1 unless the site is away.", labels=["site"])
-        age = GaugeMetricFamily("livessl_site_age_seconds", "Seconds since the site's last contact.", labels=["site"])
-        waiting = GaugeMetricFamily("livessl_site_waiting", "Messages that waited at the site.", labels=["site"])
-        missing = CounterMetricFamily("livessl_site_missing", "Messages that never came.", labels=["site"])
-        for site in self._archive.sites():
-            labels = [site["site"]]
-            site_up.add_metric(labels, float(site["status"] != "away"))
-            age.add_metric(labels, site["age_s"])
-            waiting.add_metric(labels, site["waiting"])
-            missing.add_metric(labels, site["missing"])
-        return [
-            GaugeMetricFamily("livessl_hub_takes_in", "1 while this hub takes messages in.", float(intake.has_turn)),
-            CounterMetricFamily("livessl_hub_taken", "Messages taken in.", intake.taken),
-            CounterMetricFamily("livessl_hub_rejected", "Messages that could not be stored.", intake.rejected),
-            site_up,
-            age,
-            waiting,
-            missing,
-        ]

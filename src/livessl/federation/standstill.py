@@ -12,7 +12,7 @@ STANDSTILL_S: Final = 5.0
 
 
 class Standstill:
-    """Looks at the consumer again and again, for a hub that waits for its turn."""
+    """Compares the states of the consumer that a hub sees while it waits to take over."""
 
     def __init__(self) -> None:
         self._delivered = -1
@@ -24,7 +24,7 @@ class Standstill:
         Parameters
         ----------
         consumer : ConsumerInfo
-            Its state now.
+            State of the consumer now.
         now_ns : int
             Monotonic time, in nanoseconds.
         """

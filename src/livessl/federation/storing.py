@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from itertools import groupby
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 import orjson
-from sqlalchemy import Connection, delete, insert, select
+from sqlalchemy import Connection, Table, bindparam, delete, insert, select
 
 from livessl.clock import utc_ns
 from livessl.federation.received import RECEIVED
@@ -64,18 +63,77 @@ def read(delivery: Delivery) -> JsonObject | None:
 
 
 def put(connection: Connection, batch: Sequence[tuple[str, str, JsonObject]]) -> None:
-    """Store messages in their order: events at once, as their order is that of their time, and the rest one by one."""
-    for is_event, group in groupby(batch, key=lambda each: each[1] == "event"):
-        if is_event:
-            _put_events(connection, [message for _, _, message in group])
-        else:
-            for site, kind, message in group:
-                _PUT[kind](connection, site, message)
+    """Store messages with the outcome that they have one by one in their order, by a few statements for all of them."""
+    by_kind: dict[str, list[JsonObject]] = {"event": [], "alert": []}
+    tracks_now, arrays_now = _States(tracks, "id"), _States(arrays, "name")
+    for site, kind, message in batch:
+        match kind:
+            case "start":  # the server follows no track of before, and reports all arrays that it has
+                tracks_now.clear(site)
+                arrays_now.clear(site)
+            case "track":
+                tracks_now.change(site, message, is_over=message["state"] == "end")
+            case "array":
+                arrays_now.change(site, message)
+            case _:
+                by_kind[kind].append(message)
+    _put_events(connection, by_kind["event"])
+    _put_alerts(connection, by_kind["alert"])
+    tracks_now.store(connection)
+    arrays_now.store(connection)
+
+
+class _States:
+    """What some messages leave in a table that has the last message about each thing of a site.
+
+    Parameters
+    ----------
+    table : Table
+    key : str
+        Column, and field of the messages, that says which thing it is.
+    """
+
+    def __init__(self, table: Table, key: str) -> None:
+        self._table, self._key = table, key
+        self._cleared: set[str] = set()
+        self._last: dict[tuple[str, Any], JsonObject | None] = {}
+
+    def clear(self, site: str) -> None:
+        """Forget everything of a site."""
+        self._cleared.add(site)
+        self._last = {place: message for place, message in self._last.items() if place[0] != site}
+
+    def change(self, site: str, message: JsonObject, *, is_over: bool = False) -> None:
+        """Take the last message about a thing, which exists no longer if it is over."""
+        self._last[site, message[self._key]] = None if is_over else message
+
+    def store(self, connection: Connection) -> None:
+        """Store all of that."""
+        site, key = self._table.c.site, self._table.c[self._key]
+        if self._cleared:
+            connection.execute(delete(self._table).where(site.in_(sorted(self._cleared))))
+        known = [{"of_site": name, "of_key": of} for name, of in self._last if name not in self._cleared]
+        if known:
+            connection.execute(
+                delete(self._table).where(site == bindparam("of_site"), key == bindparam("of_key")), known
+            )
+        rows = [
+            {"site": name, self._key: of, "body": orjson.dumps(message).decode()}
+            for (name, of), message in self._last.items()
+            if message is not None
+        ]
+        if rows:
+            connection.execute(insert(self._table), rows)
 
 
 def _put_events(connection: Connection, messages: Sequence[JsonObject]) -> None:
+    """Store the events that are not known yet, with the rows by which they are found."""
+    if not messages:
+        return
     rows: dict[str, dict[str, Any]] = {}
-    known_as = {f"{message['site']}/{message['id']}": message for message in messages}
+    known_as: dict[str, JsonObject] = {}
+    for message in messages:
+        known_as.setdefault(f"{message['site']}/{message['id']}", message)
     for key, message in known_as.items():
         rows[key] = {**history.event_row(message, utc_ns(message["time_utc"])), "id": key}
     query = select(history.events.c.id).where(history.events.c.id.in_(list(rows)))
@@ -95,33 +153,25 @@ def _put_events(connection: Connection, messages: Sequence[JsonObject]) -> None:
     connection.execute(insert(history.tags), tags)
 
 
-def _put_start(connection: Connection, site: str, _message: JsonObject) -> None:
-    """A server that starts follows no track of before, and reports all arrays that it has."""
-    for table in (tracks, arrays):
-        connection.execute(delete(table).where(table.c.site == site))
-
-
-def _put_array(connection: Connection, site: str, message: JsonObject) -> None:
-    connection.execute(delete(arrays).where(arrays.c.site == site, arrays.c.name == message["name"]))
-    connection.execute(insert(arrays), {"site": site, "name": message["name"], "body": orjson.dumps(message).decode()})
-
-
-def _put_track(connection: Connection, site: str, message: JsonObject) -> None:
-    connection.execute(delete(tracks).where(tracks.c.site == site, tracks.c.id == message["id"]))
-    if message["state"] != "end":
-        connection.execute(insert(tracks), {"site": site, "id": message["id"], "body": orjson.dumps(message).decode()})
-
-
-def _put_alert(connection: Connection, site: str, message: JsonObject) -> None:
-    mine = (alerts.c.site == site) & (alerts.c.key == message["key"])
-    if connection.execute(select(alerts.c.number).where(mine)).first() is None:
-        row = {
+def _put_alerts(connection: Connection, messages: Sequence[JsonObject]) -> None:
+    """Store the alerts that are not known yet, each once and in their order."""
+    first: dict[tuple[str, str], JsonObject] = {}
+    for message in messages:
+        first.setdefault((message["site"], message["key"]), message)
+    if not first:
+        return
+    names, keys = ({place[part] for place in first} for part in (0, 1))
+    query = select(alerts.c.site, alerts.c.key).where(alerts.c.site.in_(names), alerts.c.key.in_(keys))
+    known = {(site, key) for site, key in connection.execute(query)}
+    rows = [
+        {
             "site": site,
-            "key": message["key"],
+            "key": key,
             "time_ns": utc_ns(message["raised_utc"]),
             "body": orjson.dumps(message).decode(),
         }
-        connection.execute(insert(alerts), row)
-
-
-_PUT: Final = {"start": _put_start, "array": _put_array, "track": _put_track, "alert": _put_alert}
+        for (site, key), message in first.items()
+        if (site, key) not in known
+    ]
+    if rows:
+        connection.execute(insert(alerts), rows)

@@ -13,8 +13,8 @@ from livessl.core.types import Message
 from livessl.recordings.recording import TimedRecording, paced_blocks, timed_blocks
 
 BLOCKS_TOGETHER: Final = 20
-"""Blocks of a recording that are passed at once where nobody waits for them: 0.4 s, a thirtieth of the sound that a
-node remembers for backfill requests, so that no request comes too late for what it names."""
+"""Blocks of a recording that are passed at once if results need not come in real time: 0.4 s. That is a thirtieth of
+the sound that a node keeps for backfill requests, so that no request comes too late for the frames that it names."""
 
 
 def paced_messages(
@@ -27,7 +27,7 @@ def paced_messages(
     end_ns : int
         Site time at which a device would have delivered the block.
     messages : list of Message
-        Messages that the block completes; last of all, those that the pipelines still held.
+        Messages that the block completes. The last item has the messages that the pipelines still held.
     """
     end_ns = 0
     for end_ns, index, block in paced_blocks(recordings, clock):
@@ -38,7 +38,7 @@ def paced_messages(
 def unpaced_messages(
     pipelines: Sequence[Pipeline], recordings: Sequence[TimedRecording]
 ) -> Iterator[tuple[int, list[Message]]]:
-    """Yield what `paced_messages` yields by a clock that never waits, and pass many blocks of a recording at once."""
+    """Yield the same as `paced_messages` with a clock that never waits, but pass many blocks of a recording at once."""
     each = (_in_batches(index, *one) for index, one in enumerate(zip(pipelines, recordings, strict=True)))
     end_ns = 0
     for end_ns, _, messages in heapq.merge(*each, key=lambda entry: entry[:2]):

@@ -48,14 +48,14 @@ class SoundFile:
     sample_rate_hz, channels, frames : int
         `frames` is the number of complete samples of each channel.
     may_hold_anything : bool
-        True if its sample format has NaN, infinity, and values beyond full scale.
+        True if the file's sample format can hold NaN, infinity, and values beyond full scale.
     note : str or None
         Sentence about the fault of the file and how much of it is read; None for a good file.
 
     Raises
     ------
     DeviceError
-        If it is not a sound file, or cannot be read.
+        If the file is not a sound file, or cannot be read.
     """
 
     def __init__(self, path: Path) -> None:
@@ -116,7 +116,7 @@ class SoundFile:
                 yield several[begin : begin + length]
 
     def _read(self, first: int, count: int) -> Float32Array:
-        """Read the next samples (count, channels), of which the first has that number in the file."""
+        """Read the next samples (count, channels); `first` is the number of the first one in the file."""
         piece = np.empty((count, self.channels), dtype=np.float32)
         for at in range(0, count, _READ_SAMPLES):
             part = piece[at : at + _READ_SAMPLES]
@@ -185,7 +185,7 @@ class _Overlay(io.RawIOBase):
 class SoundWriter:
     """A FLAC or WAV file that is being written, and can be read at any moment.
 
-    The length in its header is brought up to date every second, so that what a killed process leaves is a sound file.
+    The length in its header is brought up to date every second, so that a killed process leaves a valid sound file.
 
     Parameters
     ----------
@@ -267,7 +267,7 @@ class SoundWriter:
             return 0.0
 
     def _update_header(self) -> None:
-        """Write the present length into the header, through a descriptor of its own: the writer's place stays."""
+        """Write the present length into the header, through another descriptor, so that the writer's position stays."""
         if self._kind == "wav":
             repair = find_repair(self._path)
             header = repair.header if repair is not None else b""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from enum import StrEnum
 from typing import Annotated, Any, Final, Literal
@@ -197,6 +198,11 @@ class BlindSpot(Model):
         description="What would show it.", examples=["clap at places that you know, and run livessl calibrate verify"]
     )
 
+    @property
+    def least(self) -> float:
+        """`least_m` of a shift, and `least_deg` of a turn; NaN in an answer that has neither."""
+        return next((least for least in (self.least_m, self.least_deg) if least is not None), math.nan)
+
 
 class Findings(Versioned):
     """Faults of the set-up that the last sounds show, errors first, and faults that they would not show."""
@@ -204,8 +210,9 @@ class Findings(Versioned):
     sounds: int = Field(ge=0, description="Number of sounds that were examined; three are the least.", examples=[12])
     findings: list[Finding]
     blind_spots: list[BlindSpot] = Field(
+        default=[],  # of a server that is older than the field
         description="What these sounds cannot show about poses. Empty with fewer than three sounds of two arrays, and "
-        "while a finding is about poses: then sizes would not hold."
+        "while a finding is about poses: then sizes would not hold.",
     )
 
 

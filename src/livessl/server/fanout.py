@@ -1,4 +1,4 @@
-"""Fans numbered messages out to subscribers; each has a filter, and a bounded queue to fall behind in."""
+"""Fans numbered messages out to subscribers, each of which has a filter and a bounded queue."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Filter:
     zone : str or None
         Only events, updates and tracks inside this zone.
     track : int or None
-        Of tracks and their changes in zones, only those of the track of this number.
+        Only the track of this number, and its changes in zones. Messages about no track pass.
     max_rate_hz : float or None
         Most messages a second on the state of one subject: a sound, a track, or the arrays. See `Pace`.
     """
@@ -83,7 +83,7 @@ class Pace:
         self._sent_s: OrderedDict[Hashable, float] = OrderedDict()
 
     def admits(self, numbered: Numbered, now_s: float) -> bool:
-        """Return whether a message is sent, at a time in seconds by any clock that does not go back."""
+        """Return whether a message is sent at `now_s`, a time in seconds by any clock that does not go back."""
         subject = numbered.subject
         if subject is None or numbered.message.get("state") in ("new", "end"):
             return True
@@ -96,16 +96,16 @@ class Pace:
 
 
 class Numbered:
-    """A numbered message on its way to the subscribers, which share it and its text.
+    """A numbered message on its way to the subscribers, which share the object and its text.
 
     Parameters
     ----------
     message : JsonObject
         With its version and number.
     published_ns : int or None
-        When it was published, by the monotonic clock, if its way to the clients is to be measured.
+        When the message was published, by the monotonic clock; None if its way to the clients is not measured.
     packed : bytes or None
-        Its text, compressed; `message` then holds only the fields that filters look at.
+        Compressed text of the message; `message` then holds only the fields that filters look at.
     """
 
     __slots__ = ("_packed", "_text", "message", "published_ns")
@@ -126,13 +126,13 @@ class Numbered:
         return self._text
 
     def packed(self) -> Numbered:
-        """Return a small copy for clients that reconnect; its way to them is not measured."""
+        """Return a small copy for clients that reconnect; the way of the copy to them is not measured."""
         fields: JsonObject = {name: self.message[name] for name in _FILTERED_BY if name in self.message}
         return Numbered(fields, packed=zlib.compress(self.text.encode(), 1))
 
     @property
     def subject(self) -> Hashable | None:
-        """The subject whose state this is; a later message on it replaces this one. None for what stays."""
+        """The subject whose state the message is, so that a later one replaces it; None for a message that is kept."""
         kind = self.message["kind"]
         return (
             None
@@ -171,7 +171,7 @@ class Subscription:
         return gone
 
     def _make_room(self, subject: Hashable | None) -> bool:
-        """Drop the older state of the same subject, or the oldest message of a full queue; return whether it did."""
+        """Drop the older state of the same subject, or the oldest message of a full queue; return whether any was."""
         older = None if subject is None else self._newest.get(subject)
         if older is not None:
             del self._waiting[older]

@@ -10,7 +10,7 @@ from livessl.core.stream.correlation_cache import ForEach
 from livessl.core.stream.final_pass import TwoPassFusion
 from livessl.server.api.encode import Messages
 from livessl.server.store import Finalized
-from livessl.server.zones.shapes import ZoneMap
+from livessl.server.zones.zone_map import ZoneMap
 from livessl.site.build.fusion import make_clock_offsets, make_two_pass_fusion
 from livessl.site.models import Site
 
@@ -26,7 +26,7 @@ class Run:
     clock_offsets : ClockOffsets
         What the fusion learns of the arrays' clocks.
     messages : Messages or None
-        Encodes what is published; None before the first message, from whose time a replay counts.
+        Encodes what is published; None before `begin`. A replay begins at the time of its first message.
     """
 
     site: Site
@@ -40,7 +40,7 @@ class Run:
 
 
 def live_run(site: Site, done: Finalized, for_each: ForEach) -> Run:
-    """Return a live run of all arrays that goes on where the final pass of the last one stopped."""
+    """Return a live run of all arrays, which continues where the final pass of the live run before it stopped."""
     return _run(site, [spec.name for spec in site.processed], done, for_each, live=True)
 
 

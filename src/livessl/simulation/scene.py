@@ -27,6 +27,10 @@ CLEARANCE_M: Final = 1.0
 MAX_JITTER_S: Final = 0.5
 """Longest random addition to the pause between sources, so that they keep no beat."""
 
+OWN_RATES_HZ: Final = (8000.0, 1e6)
+"""Lowest and highest sampling rate, in hertz, of the project's own sounds: below, half the rate is within the band of
+their hiss, and above, the samples of a second fill the memory."""
+
 TRIES: Final = 10_000
 """Number of draws after which no position is taken to be free."""
 
@@ -261,7 +265,18 @@ def truth(scene: Scene) -> list[dict[str, object]]:
 
 
 def synthesised_sounds(sample_rate_hz: float, seed: int) -> list[NamedSound]:
-    """Synthesise one of each of the project's own sounds, (name, (n,) float32); the seed determines them."""
+    """Synthesise one of each of the project's own sounds, (name, (n,) float32); the seed determines them.
+
+    Raises
+    ------
+    ValueError
+        If the sampling rate is outside `OWN_RATES_HZ`.
+    """
+    low, high = OWN_RATES_HZ
+    if not low <= sample_rate_hz <= high:
+        raise ValueError(
+            f"sampling rate: expected {low:g} to {high:g} Hz for the project's own sounds, got {sample_rate_hz:g}"
+        )
     return [
         (name, sound(np.random.default_rng([seed, index]), sample_rate_hz))
         for index, (name, sound) in enumerate(SOUNDS.items())

@@ -22,10 +22,10 @@ Seconds = Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)]
 
 
 LIFETIME_S: Final = 86_400.0
-"""Time, in seconds, for which a link opens something without a token: whoever was away for a day can still look."""
+"""Default lifetime of a link that needs no token, in seconds: a day, so that people who were away can still look."""
 
 LinkLifetimeS = Annotated[float, Field(ge=60, le=2_592_000)]
-"""Such a time in seconds, at most 30 days: a link cannot be taken back alone."""
+"""Lifetime of a link that needs no token, in seconds: at most 30 days, because a single link cannot be revoked."""
 
 T = TypeVar("T")
 
@@ -216,13 +216,18 @@ class AppriseConfig(Model):
     attach: tuple[Literal["picture", "clip"], ...] = ("picture",)
 
 
-class AlertAction(Model):
-    """One way to deliver alerts, with its time-out and retries."""
+class ActionKinds(Model):
+    """The kinds of actions: each field is one, by the name that it has in `livessl.server.alerts.actions.ACTIONS`."""
 
     webhook: WebhookConfig | None = None
     mqtt: MqttConfig | None = None
     command: Annotated[tuple[Annotated[str, Field(min_length=1)], ...], Field(min_length=1)] | None = None
     apprise: AppriseConfig | None = None
+
+
+class AlertAction(ActionKinds):
+    """One way to deliver alerts, of exactly one kind, with its time-out and retries."""
+
     timeout_s: Annotated[Positive, Field(le=600)] = 10.0
     attempts: Annotated[int, Field(ge=1, le=1000)] = 16
     first_wait_s: Positive = 1.0
@@ -230,13 +235,13 @@ class AlertAction(Model):
 
     @model_validator(mode="after")
     def _one(self) -> AlertAction:
-        _exactly_one(self, ("webhook", "mqtt", "command", "apprise"))
+        _exactly_one(self, tuple(ActionKinds.model_fields))
         return self
 
     @property
     def kind(self) -> str:
-        """Type of the action: a key of `livessl.server.alerts.actions.ACTIONS`."""
-        return next(name for name in ("webhook", "mqtt", "command", "apprise") if getattr(self, name) is not None)
+        """Kind of the action: a field of `ActionKinds`."""
+        return next(name for name in ActionKinds.model_fields if getattr(self, name) is not None)
 
 
 class LinksConfig(Model):

@@ -1,4 +1,4 @@
-"""The configuration that is in effect: every setting of a site with its value, and where that value is from."""
+"""The configuration that is in effect: every setting of a site with its value and the source of that value."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ class Setting:
     Parameters
     ----------
     place : tuple
-        Its keys, from the top of the file.
+        Keys of the setting, from the top of the file.
     value : Any
-        What JSON can hold; None for a setting that is not used.
+        Value that JSON can hold; None for a setting that is not used.
     source : str
         "FILE:LINE", or why the value is what it is, such as "default".
     line : int or None
@@ -86,7 +86,7 @@ def _measured(site: Site) -> set[str]:
 
 
 def _calibrated(setting: Setting, site: Site, measured: set[str]) -> Setting | None:
-    """Return the uncertainty of an array that the calibration file gives; None for any other setting."""
+    """Return an array's setting of `uncertainty` with the calibration file's value; None for any other setting."""
     section, array, group, key = (*setting.place, "", "", "", "")[:4]
     if section != "arrays" or array not in measured or group != "uncertainty" or setting.line is not None:
         return None
@@ -99,7 +99,7 @@ def _calibrated(setting: Setting, site: Site, measured: set[str]) -> Setting | N
 
 
 def _inherited(setting: Setting, settings: list[Setting]) -> Setting:
-    """Return the setting of an array that the file does not give with the site's value, which is in effect."""
+    """Return a setting with the site's value, if it is one of an array that the file does not give; else unchanged."""
     above = setting.place[2:] if setting.place[0] == "arrays" else ()
     if setting.line is not None or above[:1] not in (("band_hz",), ("uncertainty",)):
         return setting
@@ -110,7 +110,7 @@ def _inherited(setting: Setting, settings: list[Setting]) -> Setting:
 
 
 def _is_unused(setting: Setting) -> bool:
-    """Return True for the other forms of an array and of a shape, which are no settings of this one."""
+    """Return True for a setting of a form or shape that the array does not have, such as the edge of a circle."""
     return setting.value is None and setting.place[0] == "arrays" and setting.place[-1] in _POSE | _SHAPES
 
 
@@ -132,10 +132,7 @@ def _is_in(data: Any, place: Place) -> bool:
 
 
 def as_yaml(settings: list[Setting], width: int = 48) -> str:
-    """Return the settings as a site file that gives each of them, with the source of each as a comment.
-
-    Settings that are not used stand in comments.
-    """
+    """Return the settings as a site file, each with its source as a comment; unused settings are commented out."""
     used = {one.place[:depth] for one in settings if one.is_used for depth in range(len(one.place) + 1)}
     lines: list[str] = []
     before: Place = ()

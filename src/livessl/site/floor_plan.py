@@ -34,7 +34,7 @@ class FloorPicture:
     media_type : str
         `PNG` or `SVG`.
     bounds_m : ((float, float), (float, float))
-        Its lowest and highest x and y in metres.
+        Lowest and highest x and y of the picture, in metres.
     """
 
     data: bytes
@@ -78,7 +78,7 @@ def _png_size(data: bytes) -> tuple[float, float] | None:
 
 
 def _svg_size(data: bytes) -> tuple[float, float] | None:
-    """Return width and height of an SVG in its pixels: as it gives them, or those of its viewBox."""
+    """Return width and height of an SVG in pixels: those that it gives, or otherwise those of its viewBox."""
     tag = _SVG_TAG.search(data)
     if tag is None:
         return None

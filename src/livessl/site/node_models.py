@@ -12,7 +12,7 @@ from livessl.site.slips import counted_from_0
 
 
 class SoundDeviceConfig(Model):
-    """An audio interface, by name, and by serial number or USB port where several have one name.
+    """An audio interface, by its name, and by serial number or USB port if several interfaces have that name.
 
     `latency_s` is the latency requested from the driver, in seconds. It sets the size of the driver's buffer, and so
     how long the machine may be busy before samples are lost; blocks still arrive every `block_s`.
@@ -28,7 +28,7 @@ class SoundDeviceConfig(Model):
 
 
 class WavDeviceConfig(Model):
-    """The fake device: recorded files, played at real speed; an array has one, or several that are its channels."""
+    """Recorded files in place of a device, played in real time; an array has one file, or a file for each channel."""
 
     type: Literal["wav"]
     files: dict[str, FileName | Annotated[list[FileName], Field(min_length=1)]]
@@ -37,12 +37,12 @@ class WavDeviceConfig(Model):
 
 
 class SceneDeviceConfig(Model):
-    """A simulated scene, played at real speed."""
+    """A simulated scene in place of a device, played in real time."""
 
     type: Literal["scene"]
     rt60_s: Annotated[float, Field(ge=0, le=100)] = 0.7
     events: Annotated[int, Field(ge=1)] = 8
-    seed: int = 0
+    seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = 0
     sample_rate_hz: Positive = 44100.0
     loop: bool = True
 
@@ -51,7 +51,7 @@ DeviceConfig = SoundDeviceConfig | WavDeviceConfig | SceneDeviceConfig
 
 
 class SpoolConfig(Model):
-    """Store for the frames that the server may still need: a folder, or by default the memory."""
+    """Where a node keeps the frames that the server may still need: in a folder, or by default in memory."""
 
     directory: FileName | None = None
     max_mb: Positive = 512.0
@@ -59,7 +59,7 @@ class SpoolConfig(Model):
 
 
 class NodeConfig(Model):
-    """A capture node: one device, and one or more arrays on its channels, which count from 1."""
+    """A capture node: one device, and one or more arrays on its channels, which are counted from 1."""
 
     server: str = "tcp://127.0.0.1:5570"
     device: DeviceConfig

@@ -17,7 +17,8 @@ import yaml
 
 from alert_desk import PATIENT, alert_site, running_desk, sound
 from livessl.lab.processes import free_port
-from livessl.site.alert_models import AlertAction
+from livessl.server.alerts.actions import ACTIONS
+from livessl.site.alert_models import ActionKinds, AlertAction
 from small_site import started, wait_until
 
 PAGE = (Path(__file__).parents[3] / "docs" / "alerts.md").read_text(encoding="utf-8")
@@ -33,7 +34,8 @@ def test_example_of_a_site_file_is_valid_and_uses_every_action() -> None:
     alerts: dict[str, Any] = yaml.safe_load(block("yaml"))["alerts"]
     site = alert_site(None, {"server.events_db": "events.sqlite"}, **alerts)
     assert site.warnings == ()
-    assert {action.kind for action in site.alerts.actions.values()} == {"webhook", "mqtt", "apprise", "command"}
+    kinds = {action.kind for action in site.alerts.actions.values()}
+    assert kinds == set(ACTIONS) == set(ActionKinds.model_fields)
     assert {rule.kind for rule in site.alerts.rules.values()} == {"events", "arrays", "findings"}
 
 

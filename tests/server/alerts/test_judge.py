@@ -35,7 +35,7 @@ from livessl.server.api.encode import JsonObject, Messages
 from livessl.server.set_up_watch import SetUpState
 from livessl.server.store import Store, StoreError
 from livessl.server.zones.presence import Presence
-from livessl.server.zones.shapes import ZoneMap
+from livessl.server.zones.zone_map import ZoneMap
 from livessl.site.models import Site
 from small_site import wait_until
 

@@ -24,7 +24,7 @@ from livessl.server.alerts.message import AlertMessages
 from livessl.server.alerts.picture import MARGIN_M, MAX_PX, picture_of
 from livessl.server.alerts.rules import Match
 from livessl.server.api.encode import JsonObject, Messages
-from livessl.server.zones.shapes import ZoneMap
+from livessl.server.zones.zone_map import ZoneMap
 from livessl.site.models import Site
 from small_site import running_server, site_of, wait_until
 

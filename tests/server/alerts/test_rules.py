@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from alert_desk import ELSEWHERE, alert_site, encoded, refused, sound
 from livessl.core.types import Event, Status
 from livessl.server.alerts.rules import RuleState, Verdict, judge_event, match
-from livessl.server.zones.shapes import ZoneMap
+from livessl.server.zones.zone_map import ZoneMap
 from livessl.site.alert_models import AlertRule
 
 ZONES = ZoneMap(alert_site())

@@ -59,7 +59,7 @@ def test_filters_select_and_do_not_hold_the_position_back(server: Server, client
 @pytest.mark.parametrize(
     ("query", "status", "what"),
     [
-        ({"after": "yesterday"}, 422, "after: expected the position of an answer before, got 'yesterday'"),
+        ({"after": "yesterday"}, 422, "position from an earlier answer, such as 1a-42, got 'yesterday'"),
         ({"zone": "hall"}, 404, "no zone 'hall'; zones are door"),
         ({"limit": 0}, 422, "greater than or equal to 1"),
         ({"until": "x"}, 422, "unknown parameter 'until'"),

@@ -86,6 +86,17 @@ def test_unknown_parameter_is_refused(client: httpx.Client, path: str, cure: str
     ]
 
 
+@pytest.mark.parametrize(
+    "value", ["NaN", "-Infinity", "1e999", '"\\ud800"', "[" * 900 + "]" * 900, '{"\\udfff": NaN}', "null"]
+)
+def test_value_that_json_cannot_hold_is_refused_like_any_other(client: httpx.Client, value: str) -> None:
+    json_type = {"Content-Type": "application/json"}
+    for body in (f'{{"enabled": {value}}}', f'{{"enabled": true, "more": {value}}}', value):
+        answer = client.put(f"{API}/arrays/north/enabled", content=body, headers=json_type)
+        assert answer.status_code == 422
+        assert all(set(fault) >= {"loc", "msg", "type"} for fault in answer.json()["detail"])
+
+
 def test_every_unknown_parameter_is_named(client: httpx.Client) -> None:
     faults = client.get(f"{API}/events?zones=a&limit=3&size=4").json()["detail"]
     assert [fault["loc"][1] for fault in faults] == ["zones", "size"]

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from livessl.server.zones.book import ZoneBook, ZoneRefusedError, ZonesFileError
-from livessl.server.zones.shapes import ZoneMap
+from livessl.server.zones.zone_map import ZoneMap
 from livessl.site import zones_file
 from livessl.site.zone_models import Zone
 from small_site import Changes, site_of

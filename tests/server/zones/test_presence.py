@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from livessl.core.types import Track, TrackState
 from livessl.server.api.encode import Messages
 from livessl.server.zones.presence import Presence
-from livessl.server.zones.shapes import ZoneMap
+from livessl.server.zones.zone_map import ZoneMap
 from livessl.site.models import Site
 from livessl.site.zone_models import Zone
 from small_site import site_of

@@ -26,16 +26,17 @@ from livessl.core.types import FloatArray, IntArray
 
 MIN_LEAD: Final = 6.0
 MIN_LEAD_OF_GAIN: Final = 0.06
-"""Least lead in the same measure over the best alternative about another array or channel, and the same as a share of
-the gain: where much is explained by either of two, what distinguishes them may be the errors of the delays."""
+"""Least lead of the best alternative over the best one about another array or channel, in deviance, and as a share of
+what the best one gains: if either explains much, the errors of the delays may be what distinguishes them."""
 
 EQUAL: Final = 0.5
-"""Share of `MIN_LEAD` within which alternatives explain the sounds equally well; where much is explained, all do that
-are within the least lead."""
+"""Share of `MIN_LEAD` within which alternatives explain the sounds equally well; if the gain is large,
+`MIN_LEAD_OF_GAIN` of it is used instead."""
 
 KNOWN_MIN_GAIN: Final = 12.0
 KNOWN_MIN_LEAD: Final = 6.0
-"""The same for sounds at places that somebody measured, in the Bayesian information criterion."""
+"""Least gain over the set-up as filed, and least lead over the other alternatives, for sounds at places that somebody
+measured; both in the Bayesian information criterion."""
 
 FLOOR_S: Final = 12e-6
 """Misfit, in seconds, that remains in a set-up that is filed as well as one can measure it: microphones to 2 mm, arrays

@@ -26,11 +26,12 @@ DEAF_COHERENCE: Final = 0.35
 """Coherence, relative to the array's clearest channels, below which a channel did not receive the sound."""
 
 LEVEL_DB: Final = 3.0
-"""Median difference of level within an array, in decibels, that is told after `LEVEL_SOUNDS` sounds: the medians of ten
-sounds differ by less than 0.7 dB between good channels."""
+"""Median difference of level within an array, in decibels, that is reported after `LEVEL_SOUNDS` sounds: the medians of
+ten sounds differ by less than 0.7 dB between good channels."""
 
 LEVEL_DB_AT_ONCE: Final = 6.0
-"""The same after fewer sounds, of which single ones differ by up to 3 dB."""
+"""Median difference of level, in decibels, that is reported after fewer than `LEVEL_SOUNDS` sounds: in a single sound,
+good channels differ by up to 3 dB."""
 
 LEVEL_SOUNDS: Final = 8
 

@@ -1,7 +1,7 @@
 """Judges alternative set-ups by how well they explain sounds with the small freedom that every set-up has.
 
-All set-ups are fitted together. The few that explain the sounds about as well as the best one are what matters; the
-others are not fitted to the end.
+The set-ups are fitted together. Other orders of channels and large turns are many: `hypotheses` ranks them at the
+points of a grid, and only the best of them are fitted.
 """
 
 from __future__ import annotations
@@ -31,26 +31,29 @@ COSTS: Final = {
     "temperature": 2.0,
 }
 """Deviance that an alternative must gain to be as good as the set-up as filed: two for each unknown (Akaike), one for
-each channel in another order. A shift and a turn about any axis cost two more, because people mistake the turn about
-the vertical most (`UPRIGHT_COST`), and a microphone does, because there are many."""
+each channel in another order. A shift, and a turn about any axis, cost two more than their three unknowns, because the
+turn about the vertical alone (`UPRIGHT_COST`) is what people get wrong most often. A displaced microphone costs two
+more, because there are many microphones."""
 
 MOST_SLOPES: Final = 500_000
 """Most slopes (set-ups by sounds by channels by unknowns) of one array that are computed at one time: 4 MB."""
 
 MOST_NORMAL: Final = 8_000_000
-"""Most numbers in the normal equations of the set-ups that are fitted at one time: 64 MB. Their unknowns are those of
-all arrays, so one set-up of 30 arrays has 300 000."""
+"""Most numbers in the normal equations of the set-ups that are fitted at one time: 64 MB. The unknowns of a set-up are
+those of all its arrays, so the equations of one with 30 arrays have 300 000 numbers."""
 
 
 MIN_GAIN: Final = 7.0
-"""Least gain in the deviance of sounds at unknown places from which a set-up of one array would be said to be other
-than filed. Few careful set-ups exceed what follows from it by chance (`benchmarks/doctor_chance.py`)."""
+"""Least gain in the deviance of sounds at unknown places from which a set-up would be said to differ from the filed one
+if there were one array; `least_gain` raises it for more arrays. Few careful set-ups gain more than that by chance
+(`benchmarks/doctor_chance.py`)."""
 
 
 def least_gain(arrays: int) -> float:
-    """Return the least gain in the deviance from which a set-up is said to be other than filed.
+    """Return the least gain in the deviance from which a set-up is said to differ from the filed one.
 
-    More arrays have more alternatives, of which chance gains more: twice the logarithm of their number (Bonferroni).
+    More arrays have more alternatives, and the best of more alternatives gains more by chance: twice the logarithm of
+    the number of arrays (Bonferroni).
     """
     return MIN_GAIN + 2.0 * float(np.log(arrays))
 
@@ -88,20 +91,20 @@ class Judge:
         return self._misfit_s(self._as_filed.set_up)
 
     def may_gain(self, least: float) -> bool:
-        """Return whether a set-up that is nearly as filed may explain the sounds better by so much, and its cost."""
+        """Return whether a set-up near the filed one may gain `least`, and its cost besides, in deviance."""
         freer = self._hypotheses.freer(self._filed.places_m)
         found = zip(freer, self._fitted(freer), strict=True)
         return any(self.filed - fit.deviance >= least + (one.cost or 0.0) for one, fit in found)
 
     def judged(self) -> list[Alternative]:
-        """Return the alternatives, the best first, each with its criterion and its size as the sounds say best."""
+        """Return the alternatives, the best first, each with its criterion and with the size that fits the sounds."""
         tried = [*self._hypotheses.near(self._filed.places_m), *self._hypotheses.far()]
         found = zip(tried, self._fitted(tried), strict=True)
         judged = (_adjusted(one.alternative, fit, one.cost) for one, fit in found if one.alternative is not None)
         return sorted(judged, key=lambda one: one.criterion)
 
     def with_misfit(self, alternative: Alternative) -> Alternative:
-        """Return an alternative with the misfit of the sounds in it, which is exactly as filed otherwise."""
+        """Return an alternative with the misfit of the sounds if the filed set-up has that change and no other."""
         return replace(alternative, misfit_s=self._misfit_s(_applied(self._as_filed.set_up, alternative)))
 
     def _misfit_s(self, set_up: SetUp) -> float:
@@ -129,7 +132,7 @@ def fitted_together(set_up: SetUp) -> int:
 
 
 def _applied(filed: SetUp, alternative: Alternative) -> SetUp:
-    """Return the filed set-up as an alternative has it."""
+    """Return the filed set-up with the change of an alternative."""
     microphones, delays, c_m_s = dict(filed.microphones), dict(filed.delays), filed.c_m_s
     name, other = alternative.array, alternative.other
     if alternative.order:

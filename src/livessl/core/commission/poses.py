@@ -23,8 +23,8 @@ DELAY_STD_S: Final = 20e-6
 """Standard deviation of a measured delay in a room, seconds."""
 
 MICROPHONE_STD_M: Final = 0.002
-"""Standard deviation of each microphone's place within its array, metres: arrays are built to some millimetres. It is
-the same in all sounds, and more of them do not average it out."""
+"""Standard deviation of each microphone's place within its array, metres: arrays are built to some millimetres. The
+error of a place is the same in all sounds, so more sounds do not average it out."""
 
 UNKNOWN_M: Final = 100.0
 UNKNOWN_DEG: Final = 360.0
@@ -38,7 +38,7 @@ _TOLERANCE: Final = 1e-5
 
 _MOST_STEPS: Final = 40
 _STEP: Final = 1e-4
-"""Step of the differences, in units of these scales of the unknowns."""
+"""Step of the numerical derivatives, in units of the scales of the unknowns (`_SHIFT_SCALE_M` and those below)."""
 
 _UNKNOWNS: Final = 6
 """Unknowns of a pose: three of the shift, three of the turn."""
@@ -50,16 +50,16 @@ _SPEED_SCALE_M_S: Final = 3.0
 
 @dataclass(frozen=True, slots=True)
 class Freedom:
-    """Limits within which the set-up may differ from the site file.
+    """Standard deviations by which the set-up may differ from the site file.
 
     Parameters
     ----------
     arrays : mapping of array to (float, float)
-        Standard deviations of the position in metres and of the orientation in degrees; arrays that are not named stay.
+        Of the position in metres and of the orientation in degrees; arrays that are not named keep their poses.
     speed_std_m_s : float
-        Standard deviation of the speed of sound, m/s; 0 if it is known.
+        Of the speed of sound, m/s; 0 if the speed is known.
     microphone_std_m : float
-        Standard deviation of each microphone's place within its array along each axis, metres; 0 if it is known.
+        Of each microphone's place within its array along each axis, metres; 0 if the places are known.
     """
 
     arrays: Mapping[str, tuple[float, float]]
@@ -110,14 +110,14 @@ class Adjusted:
     c_m_s : float
         Speed of sound, m/s.
     c_std_m_s : float
-        Its standard deviation; 0 if it was known.
+        Standard deviation of the speed of sound, m/s; 0 if the speed was known.
     places_m : (S, 3) float64
         Where the sounds were, metres.
     misfits_s : (S,) float64
         Root mean square of what remains of each sound's delays, seconds.
     microphones : mapping of array to (K, 3) float64
-        Where the microphones are, with the errors of their places within the arrays as far as the sounds say these,
-        metres.
+        Positions of the microphones, metres. If their places within the arrays are not known, the offsets that the
+        sounds show are included.
     """
 
     poses: Mapping[str, Pose]
@@ -205,7 +205,7 @@ class _Problem:
         self.scale = np.array(few + [1.0] * places_m.size)
 
     def at(self, adjusted: Adjusted) -> FloatArray:
-        """Return the unknowns of a result, with the microphones where they were built."""
+        """Return the unknowns of a result; the microphones have no offsets from their places within the arrays."""
         unknowns = self.start.copy()
         for index, name in enumerate(self._free):
             pose = adjusted.poses[name]
@@ -304,21 +304,25 @@ class _Problem:
 
 
 def moved(microphones_m: FloatArray, shift_m: FloatArray, turn: FloatArray) -> FloatArray:
-    """Positions after a turn (a vector, radians) about their centre and a shift, metres."""
+    """Return positions (K, 3) after a turn about their centre (a rotation vector, radians) and then a shift, metres."""
     centre_m = microphones_m.mean(axis=0)
     return np.asarray(Rotation.from_rotvec(turn).apply(microphones_m - centre_m) + centre_m + shift_m)
 
 
 def line_axis(microphones_m: FloatArray) -> FloatArray | None:
-    """Direction (3,) of the line that microphones (K, 3) are on; None if they are on none. Two are always on one."""
+    """Return the direction (3,) of the line on which microphones (K, 3) lie; None if they lie on none.
+
+    Two microphones always lie on a line.
+    """
     _, extent_m, axes = np.linalg.svd(microphones_m - microphones_m.mean(axis=0), full_matrices=False)
     return np.asarray(axes[0]) if extent_m[1] <= LINE * extent_m[0] else None
 
 
 def without_spin(covariance: FloatArray, microphones_m: FloatArray) -> FloatArray:
-    """Covariance (..., 6, 6) of a pose if the turn of a line of microphones about itself is given; else as it is.
+    """Return the covariance (..., 6, 6) of a pose, without the turn of a line of microphones about its own axis.
 
-    Such a turn moves no microphone, so that no sound determines it, and nothing depends on it.
+    Such a turn moves no microphone, so no sound determines it and nothing depends on it. The covariance of an array
+    that is no line is returned unchanged.
     """
     axis = line_axis(microphones_m)
     if axis is None:

@@ -1,14 +1,15 @@
 """Refines the poses of arrays and the speed of sound from sounds at unknown places, with at least one array known.
 
 The places of the sounds and the poses are estimated together. The delays within the arrays are enough: the arrays need
-no common clock. Where some have one, the times between them determine distances. Where the whole set-up is in the
-room cannot be determined so, and one array stays as it is filed.
+no common clock. Where some arrays have one, the times between these arrays determine distances. Sounds at unknown
+places do not show where in the room the whole set-up is, so one array at least stays as it is filed.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import replace
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -21,20 +22,21 @@ from livessl.core.commission.resection import SPEED_STD_M_S, MeasuredSetUp, desc
 from livessl.core.types import FloatArray
 
 LEAST_UNKNOWN: Final = 10
-"""Fewest sounds at unknown places from which an array is refined: each brings three unknowns of its own."""
+"""Fewest sounds at unknown places from which an array is refined: each sound brings three unknowns of its own."""
 
 POSITION_STD_M: Final = 0.5
 """Standard deviation of a filed position that is refined, metres: as exact as one that is paced out."""
 
 OUTLIER: Final = 3.5
-"""Misfit of a sound, in medians of all, from which it does not count: an array received an echo or another sound."""
+"""Misfit of a sound, in medians of all misfits, above which the sound is not used: an array received an echo or another
+sound."""
 
 LEAST_OUTLIER_S: Final = 30e-6
 """Misfit, in seconds, below which no sound is an outlier."""
 
 CONTRADICTION: Final = 3.0
-"""Misfit with the times between arrays, in misfits without them, from which they contradict the delays. Then they
-are left out, and positions are no better known than in the site file."""
+"""Misfit with the times between arrays, in misfits without these times, above which the times contradict the delays.
+Then the times are left out, and positions are no better known than in the site file."""
 
 LEAST_STD_S: Final = 5e-6
 """Least standard deviation of the delays that is assumed, seconds."""
@@ -59,7 +61,7 @@ def refine(
     microphones : mapping of array to (K, 3) float64
         As filed, metres. Orientations may be wrong.
     delays : mapping of array to (S, K) float64
-        Delays of the same sounds, seconds; NaN where an array did not receive one.
+        Delays of the same S sounds, seconds; NaN where an array did not receive a sound.
     bounds_m : (3, 2) float64
         Search volume, metres.
     c_m_s : float
@@ -74,7 +76,7 @@ def refine(
     Returns
     -------
     MeasuredSetUp
-        With the poses of the other arrays. The misfits of a pose count all arrays.
+        With the poses of the arrays that are not `known`. The misfits of a pose are those of all arrays together.
 
     Raises
     ------
@@ -106,14 +108,7 @@ def refine(
     exact = replace(freedom, microphone_std_m=MICROPHONE_STD_M)
     last = _adjusted(start, kept, search, exact, std_s)
     if times is not None:
-        # poses that fit all times between arrays, but not the delays within them, are another lowest point far away
-        with_times = _adjusted(start, kept, search, exact, std_s, times, last)
-        off_s = times.contradictions_s(with_times.microphones, with_times.places_m, with_times.c_m_s)
-        if _rms(off_s) > times.std_s:  # an array received some sounds by an echo
-            times = replace(times, std_s=_rms(off_s))
-            with_times = _adjusted(start, kept, search, exact, std_s, times, with_times)
-        if _rms(with_times.misfits_s) <= max(CONTRADICTION * _rms(last.misfits_s), LEAST_STD_S):
-            last = with_times
+        last = _with_times(times, last, partial(_adjusted, start, kept, search, exact, std_s))
     placed = {name: last.microphones[name] if name in free else at_m for name, at_m in start.items()}
     before_s = search.fit(microphones, kept).misfit_s
     after_s = PlaceSearch(bounds_m, last.c_m_s).fit(placed, kept).misfit_s
@@ -140,6 +135,25 @@ def _adjusted(
     )
 
 
+def _with_times(times: Arrivals, without: Adjusted, adjusted: Callable[[Arrivals, Adjusted], Adjusted]) -> Adjusted:
+    """Return the set-up that fits the times between arrays as well, or `without` them if they contradict it.
+
+    Parameters
+    ----------
+    times : Arrivals
+    without : Adjusted
+        The set-up that fits the delays within the arrays.
+    adjusted : callable
+        Fits a set-up to the delays and to times between arrays, beginning with a set-up.
+    """
+    found = adjusted(times, without)
+    off_s = times.contradictions_s(found.microphones, found.places_m, found.c_m_s)
+    if _rms(off_s) > times.std_s:  # an array received some sounds by an echo
+        found = adjusted(replace(times, std_s=_rms(off_s)), found)
+    # poses that fit all times between arrays, but not the delays within them, are another lowest point far away
+    return found if _rms(found.misfits_s) <= max(CONTRADICTION * _rms(without.misfits_s), LEAST_STD_S) else without
+
+
 def _rms(misfits_s: FloatArray) -> float:
     return float(np.sqrt(np.mean(misfits_s**2)))
 
@@ -147,7 +161,10 @@ def _rms(misfits_s: FloatArray) -> float:
 def _turned(
     microphones: Microphones, delays: Delays, search: PlaceSearch, free: Collection[str]
 ) -> dict[str, FloatArray]:
-    """Turn each free array so that its delays fit those of the known arrays best: where to begin."""
+    """Return the microphones with each free array turned so that its delays fit those of the known arrays best.
+
+    The adjustment begins there.
+    """
     found = dict(microphones)
     known = [name for name in microphones if name not in free]
     of_known = np.sum([search.costs(search.table_s(microphones[name]), delays[name]) for name in known], axis=0)

@@ -54,11 +54,12 @@ class Tap:
         Inputs within 10 dB of the loudest, counted from 0, the loudest first. One input is a tap; several are a sound
         in the room, or one signal on several inputs.
     peak_dbfs : float
-        Peak of the loudest, without its constant part, dB re full scale.
+        Peak of the loudest input, without its constant part, dB re full scale.
     rise_db : float
-        Rise of the loudest over its background.
+        Rise of the loudest input over its background, dB.
     margin_db : float or None
-        Peak of the loudest over that of the next input that the sound reached; None if it reached no other.
+        Peak of the loudest input over that of the next input that the sound reached, dB; None if the sound reached no
+        other input.
     """
 
     time_s: float

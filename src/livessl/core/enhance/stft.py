@@ -15,13 +15,13 @@ Spectra = NDArray[np.complexfloating[Any, Any]]
 """Complex arrays of either precision."""
 
 WINDOW_S: Final = 0.064
-"""Length of a window, in seconds: long against the delays within an array and its early reflections, short enough for
-twenty windows in the pre-roll."""
+"""Length of a window, in seconds: long against the delays within an array and against early reflections, but short
+enough for twenty windows in the pre-roll."""
 
 
 @dataclass(frozen=True, slots=True)
 class Stft:
-    """Short-time spectra with windows of `size` samples and a hop of half of it.
+    """Short-time spectra with windows of `size` samples and a hop of half a window.
 
     The square root of a Hann window is applied before and after, so that `inverse(forward(x))` is x.
 
@@ -53,7 +53,7 @@ class Stft:
         return np.asarray(np.fft.rfftfreq(self.size, 1.0 / sample_rate_hz))
 
     def forward(self, samples: RealArray) -> Spectra:
-        """Return the spectra (..., T, F) of samples (..., n); the first and the last window are half outside."""
+        """Return the spectra (..., T, F) of samples (..., n); half of the first and last window is padding."""
         windows = self._cut(samples) * self.window.astype(np.float32)
         return np.asarray(scipy.fft.rfft(windows, axis=-1), dtype=np.complex64)
 
@@ -67,7 +67,7 @@ class Stft:
         return np.asarray(padded.ravel()[self.hop : self.hop + length])
 
     def share(self, mask: BoolArray) -> FloatArray:
-        """Return the share (T,) of each window's energy in which a mask (n,) is true; outside it counts as false."""
+        """Return the share (T,) of each window's energy where a mask (n,) is true; beyond its ends it is false."""
         return np.asarray(self._cut(mask.astype(np.float64)) @ (self.window**2) / (self.window**2).sum())
 
     def _cut(self, samples: RealArray) -> RealArray:

@@ -1,8 +1,8 @@
 """Aligns the frames of all arrays on one frame index, and decides which are late for early results. It reads no clock.
 
-A frame index closes when every array that is awaited has reached it, or at its deadline. A frame that comes later is
-counted as late. Early results that were already computed do not include it; the final pass (`final_pass`) does. An
-array is awaited while it sends, keeps up, and is not excluded.
+A frame index closes when every array that is awaited has reached it, or at its deadline. An active frame that comes
+later is kept and counted as late. Early results that were already computed do not include it; the final pass
+(`final_input`) does. An array is awaited while it sends, keeps up, and is not excluded.
 """
 
 from __future__ import annotations
@@ -184,13 +184,13 @@ class Alignment:
     def _may_close(self, frame_index: int) -> bool:
         while self._reached and self._reached[0][0] < frame_index:
             self._reached.popleft()
-        late = [stream for stream in self.streams.values() if self._is_awaited(stream, frame_index)]
-        if not late:
+        missing = [stream for stream in self.streams.values() if self._is_awaited(stream, frame_index)]
+        if not missing:
             return True
         first_ns = self._reached[0][1] if self._reached else self.now_ns
         if self.now_ns - first_ns < self._deadline_s * 1e9:
             return False
-        for stream in late:
+        for stream in missing:
             stream.fall_behind()
             stream.health.note_late(self.now_ns)
         return True

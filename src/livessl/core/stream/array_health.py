@@ -130,7 +130,7 @@ class ArrayHealth:
         self.note(now_ns, fault)
 
     def note_late(self, now_ns: int, frames: int = 0) -> None:
-        """Note that frames are late, and count those of them that have come."""
+        """Note that the array is late; `frames` is the number of late frames that have come, 0 if none has yet."""
         self.counters["late"] += frames
         self.note(now_ns, "its frames come after their deadline")
 

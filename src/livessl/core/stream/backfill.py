@@ -33,7 +33,7 @@ MOST_REQUESTED_S: Final = 3.0
 the rest of a longer one."""
 
 SHARE: Final = 0.25
-"""Most of an array's sound, as a share, that is requested in the long run; at the start `RECENT_S` of it may be."""
+"""Largest share of an array's sound that is requested in the long run; at the start `RECENT_S` of sound may be."""
 
 _RANK: Final = {Status.REFUSED: 0, Status.DIRECTION_ONLY: 1, Status.LOCATED: 2}
 
@@ -113,7 +113,7 @@ class Backfill:
 
 @dataclass(slots=True)
 class Allowance:
-    """Number of frames that may still be requested from one array; it grows with time. Frame indices are joint ones."""
+    """Number of frames that may still be requested from one array, which grows with time. Frame indices are joint."""
 
     left: float = RECENT_S / FRAME_S
     at: int | None = None

@@ -36,8 +36,8 @@ COMPARED_FRAMES: Final = 4
 """Number of frames, from the beginning of a sound, in which an array's channels are compared."""
 
 COPIED_SOUNDS: Final = 3
-"""The same number of sounds, which counts where the background is digital silence. Two microphones may receive exactly
-the same of a single sound, if it comes from the plane in the middle between them."""
+"""Number of sounds in a row in which channels must be the same where the background is digital silence and shows
+nothing. Two microphones may receive exactly the same of one sound, if it comes from the plane midway between them."""
 
 SAME: Final = 0.99
 """Least correlation, and least mean cosine of the phase differences, of channels that are the same. Copies give 1.

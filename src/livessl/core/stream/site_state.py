@@ -18,13 +18,13 @@ from livessl.core.stream.parameters import FusionParameters
 from livessl.core.types import ArraySpec, Frame, Message
 
 MOST_CORRELATED: Final = 32
-"""Most arrays whose frames are correlated for an event: those to which it is clearest, twice as many as the default
-method locates with. Correlating the others costs most of what an array costs, and does not move the position."""
+"""Most arrays whose frames are correlated for an event: the clearest arrays, twice as many as the default method
+locates with. Correlation is most of what an array costs, and that of further arrays does not move the position."""
 
 
 @dataclass(frozen=True, slots=True)
 class ArraySetUp:
-    """The arrays at their places, and what locates with them.
+    """The arrays at their places, and the estimator and cache that are made for these places.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ class _Conditions:
 
 
 class SiteState:
-    """State of a site. All but the set-up of the arrays is shared by its passes.
+    """State of a site. The passes over its messages share everything but the set-up of the arrays.
 
     Parameters
     ----------
@@ -66,10 +66,10 @@ class SiteState:
     clock_offsets : ClockOffsets or None
         Offsets of the arrays' clocks, learned from events; None takes all clocks to agree.
     for_each : ForEach or None
-        Correlates several arrays, perhaps in parallel; None does one after the other.
+        Correlates several arrays, perhaps in parallel; with None, one after the other.
     free_axes : sequence of int
-        Axes along which the search volume is not flat: those of a position's set-up error where an estimator returns no
-        covariance.
+        Axes along which the search volume is not flat. Where an estimator returns no covariance, the error of the
+        set-up has these axes.
     """
 
     def __init__(
@@ -96,7 +96,7 @@ class SiteState:
     # --- the set-up of the arrays, which each pass follows by itself
 
     def for_another_pass(self) -> SiteState:
-        """Return the state for another pass over the same messages: it follows the set-up of the arrays by itself."""
+        """Return the state for another pass over the same messages; that pass follows the set-up by itself."""
         other = copy(self)
         other._following = deque(self._following)
         return other
@@ -117,7 +117,7 @@ class SiteState:
         return self._set_up.cache
 
     def follow(self, set_up: ArraySetUp, first: int | None) -> None:
-        """Use another set-up of the same arrays from a frame index on; None for at once."""
+        """Use another set-up of the same arrays from the frame index `first` on, or at once if that is None."""
         if first is None:
             self._set_up = set_up
             self._following.clear()
@@ -125,20 +125,30 @@ class SiteState:
             self._following.append((first, set_up))
 
     def advance(self, frame_index: int) -> bool:
-        """Use the set-up that applies at a frame index before which all events are reported; return if it changed."""
+        """Use the set-up that applies at a frame index before which all events are reported.
+
+        Return whether it is another one than before.
+        """
         before = self._set_up
         while self._following and self._following[0][0] <= frame_index:
             self._set_up = self._following.popleft()[1]
         return self._set_up is not before
 
     def use_newest(self) -> None:
-        """Use the set-up that was given last: the frame indices from which others were to apply are void."""
+        """Use the set-up that was given last at once, whatever the frame indices from which set-ups were to apply."""
         if self._following:
             self._set_up = self._following[-1][1]
             self._following.clear()
 
+    def start_over(self) -> None:
+        """Forget what was learned of the arrays, because the server's clock was set back."""
+        self.use_newest()
+        self.cache.clear()
+        self.votes.clear()
+        self.channel_faults.clear()
+
     def prepare(self, array: str, sample_rate_hz: float) -> None:
-        """Compute what an array's sound will need, with every set-up that is to be used."""
+        """Compute in advance what locating an array's sound needs, for the set-up in use and those that follow."""
         for set_up in (self._set_up, *(following for _, following in self._following)):
             set_up.estimator.prepare(array, sample_rate_hz)
 
@@ -150,12 +160,12 @@ class SiteState:
         return self._conditions.relief
 
     def relieve(self, relief: Relief) -> None:
-        """Shed this from now on."""
+        """Shed the work that `relief` names from now on."""
         self._conditions.relief = relief
 
     @property
     def most_arrays(self) -> int:
-        """Most arrays that an event or a window is located from; never fewer than `min_arrays`."""
+        """Most arrays from which an event or a window is located; while work is shed, at least `min_arrays`."""
         shed = self.relief.arrays
         least = self.parameters.min_arrays
         return MOST_CORRELATED if shed is None else max(least, min(shed, MOST_CORRELATED))
@@ -172,13 +182,13 @@ class SiteState:
         return array in self._conditions.excluded
 
     def without_excluded(self, message: Message) -> Message:
-        """Return a message as it is used: no frame of an excluded array is active."""
+        """Return a message, with a frame of an excluded array marked as not active."""
         if message.array in self._conditions.excluded and isinstance(message, Frame) and message.active:
             return replace(message, active=False)
         return message
 
     def set_answers(self, array: str, answers: bool) -> None:
-        """Record whether the node of an array answers backfill requests; at first none does."""
+        """Record whether the node of an array answers backfill requests; at first no node is known to."""
         answering = self._conditions.answering
         (answering.add if answers else answering.discard)(array)
 

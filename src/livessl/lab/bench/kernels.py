@@ -2,7 +2,8 @@
 
 Two or more arrays of four microphones stand in the paper's room of 8 x 10 x 4 m with a reverberation time of 0.7 s; a
 block has 4096 samples. Every round times each case twice: in turn, when the other cases have filled the caches, and
-again right after. The rounds spread other load on the machine evenly over all cases; medians are reported.
+again right after, with the next block. The rounds spread other load on the machine evenly over all cases. Medians are
+reported.
 """
 
 from __future__ import annotations
@@ -58,9 +59,9 @@ class Timing:
     ----------
     name : str
     median_ms, p99_ms, least_ms : float
-        Times in turn with all other cases.
+        Times of the first run in a round, after the other cases have filled the caches.
     again_median_ms, again_p99_ms : float
-        Times right after, with the next block.
+        Times of the second run, right after the first, with the next block.
     ratio : float or None
         Ratio of the median to the time of as many bare look-ups on this machine.
     least_ratio : float or None

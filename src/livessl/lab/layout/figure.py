@@ -19,7 +19,7 @@ COLUMNS: Final = 4
 """Arrays in a row of the enlarged views."""
 
 MOST_ARRAYS: Final = 16
-"""Most arrays that are enlarged: the first ones of the file."""
+"""Largest number of arrays that are enlarged; the first ones in the site file are taken."""
 
 MARGIN: Final = 0.06
 """Margin of a view, as a share of its longest side."""

@@ -22,7 +22,7 @@ TALL: Final = 2.0
 """Height of a character in widths."""
 
 MOST_PAIRS: Final = 6
-"""Most pairs of arrays whose distance is listed: those of four arrays. The table has each one's nearest anyway."""
+"""Most pairs of arrays whose distance is listed: those of four arrays. The table names the nearest array of each."""
 
 LETTERS: Final = string.ascii_uppercase + string.ascii_lowercase
 """Marks of the arrays on the plan; arrays beyond the last share a mark."""

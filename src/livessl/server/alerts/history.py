@@ -12,7 +12,7 @@ from livessl.clock import utc_ns
 from livessl.server.alerts.rules import SUPPRESSED, RuleState, Verdict, judge_event, match
 from livessl.server.api.encode import JsonObject
 from livessl.server.store import Query, Store
-from livessl.server.zones.shapes import ZoneMap
+from livessl.server.zones.zone_map import ZoneMap
 from livessl.site.alert_models import AlertRule, AlertsConfig
 
 PAGE: Final = 500

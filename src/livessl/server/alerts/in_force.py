@@ -19,7 +19,7 @@ from livessl.server.alerts.outbox import Outbox
 from livessl.server.event_traces import EventTraces
 from livessl.server.signed_links import SignedLinks
 from livessl.server.store import Store
-from livessl.server.zones.shapes import ZoneMap
+from livessl.server.zones.zone_map import ZoneMap
 from livessl.site.alert_checks import outbox_file
 from livessl.site.alert_models import AlertsConfig
 from livessl.site.models import Site

@@ -15,7 +15,7 @@ from livessl.server.alerts.outbox import Outbox, Raised
 from livessl.server.alerts.rules import RuleState, Verdict, judge_and_note, judge_event, match
 from livessl.server.api.encode import JsonObject
 from livessl.server.set_up_watch import SetUpState
-from livessl.server.zones.shapes import ZoneMap
+from livessl.server.zones.zone_map import ZoneMap
 from livessl.site.models import Site
 
 

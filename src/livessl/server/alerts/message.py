@@ -38,19 +38,26 @@ class AlertMessages:
         self._has_clips = site.server.clips is not None
 
     def key(self, rule: str, subject: str) -> str:
-        """Return the key of a rule's alert about an event, or about something else that a text names.
+        """Return the key of a rule's alert.
 
-        It follows from its arguments alone: what is alerted again after a crash has the same key.
+        The key depends on the site, the rule and the subject alone, so an alert that is raised again after a crash has
+        the same key.
+
+        Parameters
+        ----------
+        rule : str
+        subject : str
+            Id of the event that the alert is about, or a text that names its other subject.
         """
         digest = hashlib.sha256("\0".join((self._site, rule, subject)).encode()).hexdigest()
         return KEY_PREFIX + digest[:KEY_DIGITS]
 
     def key_of_change(self, rule: str, change: JsonObject, time_ns: int) -> str:
-        """Return the key of a rule's alert about what a track did in a zone at some site time."""
+        """Return the key of a rule's alert about a change of a track in a zone at `time_ns`, a site time."""
         return self.key(rule, _change_subject(change, time_ns))
 
     def of_event(self, rule: str, event: JsonObject, match: Match, count: int, raised_ns: int) -> JsonObject:
-        """Return the alert about an event, the last of `count` that the rule asks for."""
+        """Return the alert about an event, which completes the `count` events that the rule waits for."""
         zones = [{"name": name, "probability": round(value, 4)} for name, value in match.zones.items()]
         return {
             **self._head(rule, event["id"], raised_ns),
@@ -81,7 +88,7 @@ class AlertMessages:
         }
 
     def of_array(self, rule: str, array: JsonObject, since_ns: int, raised_ns: int) -> JsonObject:
-        """Return the alert about an array that has been in a bad state since some site time."""
+        """Return the alert about an array that has been in a bad state since `since_ns`, a site time."""
         name, state, reason = array["name"], array["state"], array["reason"]
         text = f"array {name!r} is {state}" + (f": {reason}" if reason else "")
         subject = f"array {name} {state} {since_ns}"
@@ -89,7 +96,10 @@ class AlertMessages:
         return self._of_condition(rule, subject, since_ns, raised_ns, text, array=seen)
 
     def of_finding(self, rule: str, finding: Finding, about: str, since_ns: int, raised_ns: int) -> JsonObject:
-        """Return the alert about a fault of the set-up, which a text names, that has shown since some site time."""
+        """Return the alert about a fault of the set-up that has shown since `since_ns`, a site time.
+
+        The text `about` names the fault in the alert's key.
+        """
         subject = f"finding {about} {since_ns}"
         text = f"{finding.message}; {finding.cure}"
         seen = {"kind": "finding", **asdict(finding)}
@@ -130,7 +140,7 @@ class AlertMessages:
 def with_links(alert: JsonObject, links: SignedLinks, config: LinksConfig, url: str) -> JsonObject:
     """Return an alert with links that open its picture and its recording without a token until they expire.
 
-    They are signed when it is delivered, and stored nowhere: not everyone who may read alerts by the API may listen.
+    Links are signed at delivery and never stored, because viewers may read stored alerts but not open recordings.
 
     Parameters
     ----------
@@ -183,7 +193,7 @@ def _event_text(event: JsonObject, zones: Mapping[str, float], count: int) -> st
 
 
 def _change_subject(change: JsonObject, time_ns: int) -> str:
-    """Return what names a change of a track for ever: two of one track, zone and time are one."""
+    """Return the subject of an alert about a change: changes of one kind, track, zone and time have the same text."""
     return f"track {change['track_id']} {change['change']} {change['zone']} {time_ns}"
 
 

@@ -31,7 +31,7 @@ class Notification:
     Raises
     ------
     ConfigError
-        If Apprise is not installed, or the file does not hold a URL that it knows.
+        If Apprise is not installed, or the file holds no URL that Apprise knows.
     """
 
     def __init__(self, setting: ActionSetting) -> None:
@@ -57,7 +57,7 @@ class Notification:
         yield
 
     async def deliver(self, alert: JsonObject) -> None:
-        """Send an alert; after an attempt that failed, without files: these may be why it failed.
+        """Send an alert, with its files unless an earlier attempt failed, for which the files may be the reason.
 
         Raises
         ------
@@ -73,7 +73,7 @@ class Notification:
             raise
 
     async def _files(self, alert: JsonObject) -> tuple[bytes | None, Path | None]:
-        """Return the picture and the clip that are to be attached; an alert that may be early waits for no clip."""
+        """Return the picture and the clip that are to be attached; alerts of a rule with `early` wait for no clip."""
         picture = self._evidence.picture(alert) if "picture" in self._attached else None
         if "clip" not in self._attached:
             return picture, None

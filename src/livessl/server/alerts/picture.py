@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from livessl.core.types import FloatArray
 from livessl.server.api.encode import JsonObject
 from livessl.server.api.png import encode_png, map_colours
-from livessl.server.zones.shapes import ZoneMap
+from livessl.server.zones.zone_map import ZoneMap
 from livessl.site.models import Site
 
 DEFAULT_PX: Final = 640

@@ -9,7 +9,7 @@ from typing import Any, Final, Self
 
 from livessl.server.alerts.schedule import is_open
 from livessl.server.api.encode import JsonObject
-from livessl.server.zones.shapes import ZoneMap
+from livessl.server.zones.zone_map import ZoneMap
 from livessl.site.alert_models import AlertRule, EventCondition
 
 NS_PER_S: Final = 1_000_000_000

@@ -9,7 +9,7 @@ from livessl.site.alert_models import DAYS, ScheduleSpan
 
 
 def is_open(schedule: Sequence[ScheduleSpan], time_ns: int, zone: str | None) -> bool:
-    """Return whether a schedule holds at an instant; one without spans always does.
+    """Return whether a schedule holds at an instant; a schedule without spans always holds.
 
     A span over midnight belongs to the day on which it begins: `days: [fri], begin: "22:00", end: "06:00"` lasts until
     Saturday morning.

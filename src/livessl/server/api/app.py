@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Final
 
 from fastapi import Depends, FastAPI, Request, Response
+from fastapi.exceptions import RequestValidationError
 from fastapi.responses import FileResponse, JSONResponse
 from fastapi.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -30,7 +31,7 @@ from livessl.server.api.metrics import metrics_route
 from livessl.server.api.point_routes import point_route
 from livessl.server.api.proposal_routes import proposal_routes
 from livessl.server.api.proxy import BehindProxy
-from livessl.server.api.queries import refuse_unknown_parameters
+from livessl.server.api.queries import refuse_request, refuse_unknown_parameters
 from livessl.server.api.reload_routes import reload_route
 from livessl.server.api.relocate_routes import relocate_route
 from livessl.server.api.set_up_routes import set_up_routes
@@ -64,14 +65,7 @@ def create_app(parts: Parts, access: Access) -> FastAPI:
         openapi_url="/api/v1/openapi.json",
         responses=errors(401, 403) if access.wanted else {},
     )
-    app.add_middleware(_HeadAsGet)
-    app.add_middleware(Gate, access=access, refusals=parts.refusals)
-    if site.server.http.allowed_origins:
-        app.add_middleware(other_origins, http=site.server.http, shown=tuple(routes.MAP_HEADERS))
-    app.add_middleware(HostCheck, names=names, refusals=parts.refusals)
-    app.add_middleware(SafeHeaders, http=site.server.http, page=STATIC / "index.html")
-    app.add_middleware(BehindProxy, http=site.server.http)
-
+    _add_middleware(app, parts, access, names)
     strict = [Depends(refuse_unknown_parameters)]
     for router in (
         routes.state_routes(parts),
@@ -101,6 +95,27 @@ def create_app(parts: Parts, access: Access) -> FastAPI:
     documentation.add_documentation(app)
 
     app.add_exception_handler(StoreError, _without_database)
+    app.add_exception_handler(RequestValidationError, refuse_request)
+    _add_pages(app)
+    if access.wanted:
+        _describe_tokens(app.openapi())
+    return app
+
+
+def _add_middleware(app: FastAPI, parts: Parts, access: Access, names: ServerNames) -> None:
+    """Add what every request passes before it gets to a route; what is added last comes first."""
+    http = parts.site.server.http
+    app.add_middleware(_HeadAsGet)
+    app.add_middleware(Gate, access=access, refusals=parts.refusals)
+    if http.allowed_origins:
+        app.add_middleware(other_origins, http=http, shown=tuple(routes.MAP_HEADERS))
+    app.add_middleware(HostCheck, names=names, refusals=parts.refusals)
+    app.add_middleware(SafeHeaders, http=http, page=STATIC / "index.html")
+    app.add_middleware(BehindProxy, http=http)
+
+
+def _add_pages(app: FastAPI) -> None:
+    """Add the pages of the dashboard and their files."""
 
     @app.get("/", include_in_schema=False)
     async def dashboard() -> FileResponse:
@@ -115,9 +130,6 @@ def create_app(parts: Parts, access: Access) -> FastAPI:
         return FileResponse(STATIC / "embed.html")
 
     app.mount("/static", StaticFiles(directory=STATIC), name="static")
-    if access.wanted:
-        _describe_tokens(app.openapi())
-    return app
 
 
 async def _without_database(_request: Request, error: Exception) -> Response:

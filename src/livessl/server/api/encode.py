@@ -14,7 +14,7 @@ from livessl.clock import utc_text
 from livessl.core.stream.activity import ActivityParameters
 from livessl.core.stream.array_health import ArrayStatus
 from livessl.core.types import FRAME_S, Contribution, Estimate, Event, Track, Update
-from livessl.server.zones.shapes import ZoneMap, fixed_zones
+from livessl.server.zones.zone_map import ZoneMap, fixed_zones
 from livessl.site.models import Site
 
 API_VERSION: Final = 1
@@ -33,7 +33,7 @@ class Stages:
     sent : float
         Time until the node had sent the last message that the answer needs, by the node's clock.
     received : float
-        Time until the server had received it; the difference of two clocks unless node and server share a machine.
+        Time until the server had received that message; compares two clocks unless both are on one machine.
     located : float
         Time until the answer was computed, by the server's clock.
     """
@@ -63,7 +63,7 @@ class Messages:
     origin_ns : int
         Site time at which `start_s` is 0: the beginning of the recording or of the live run, in nanoseconds.
     utc : bool
-        Whether site time is UTC; it is not where a recording does not say when it was made. Then `time_utc` is null.
+        Whether site time is UTC. If a recording does not say when it was made, it is not, and `time_utc` is null.
     zones : callable or None
         Returns the zones that are in force; None for those of the site.
     """

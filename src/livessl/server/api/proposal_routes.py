@@ -1,4 +1,4 @@
-"""REST routes of the poses: what is in force, proposals, and how they are accepted and undone."""
+"""REST routes of the poses: those in force, proposals of others, and how a proposal is accepted and undone."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from livessl.server.set_up_in_force import CalibrationFileError, OutOfDateError,
 from livessl.site.models import Site
 
 _TEXTS: Final = {
-    404: "There is no such array, sound or proposal any more, or no calibration to go back to.",
-    409: "Another measurement is running, or the proposal cannot come into force, for a reason that is given.",
+    404: "The array, sound or proposal does not exist, or does not exist any more, or there is no former calibration.",
+    409: "Another measurement is running, or the proposal cannot come into force; the detail says why.",
     503: "The calibration file cannot be written.",
 }
 _ERRORS: Final = errors(400, 404, 409, 411, 413, 503, texts=_TEXTS)
@@ -35,7 +35,7 @@ _log = logging.getLogger(__name__)
 
 
 def proposal_routes(parts: Parts) -> APIRouter:
-    """The set-up in force, proposals for its poses, and changes of it."""
+    """Routes of the set-up in force, of proposals for its poses, and of changes to it."""
     set_up, proposals, router = parts.set_up, parts.proposals, APIRouter(tags=["state"])
     first = _FirstPlace()
 
@@ -54,9 +54,9 @@ def proposal_routes(parts: Parts) -> APIRouter:
 
     @router.post("/api/v1/set-up/measure", response_model=set_up_schema.OneProposal, responses=_ERRORS)
     def post_measure(request: set_up_schema.MeasureRequest) -> Response:
-        """Measure the poses of the arrays by sounds at measured places; a proposal, which changes nothing.
+        """Measure the poses of the arrays by at least four sounds at measured places; eight sounds are usual.
 
-        Four sounds are the least, eight are usual.
+        The answer is a proposal, which changes nothing.
         """
         places_m = np.array([clap.place_m for clap in request.claps], dtype=np.float64)
         with _refusals():
@@ -65,7 +65,10 @@ def proposal_routes(parts: Parts) -> APIRouter:
 
     @router.post("/api/v1/set-up/refine", response_model=set_up_schema.OneProposal, responses=_ERRORS)
     def post_refine(request: set_up_schema.RefineRequest) -> Response:
-        """Refine the poses of the arrays by the last sounds, wherever these were made; changes nothing."""
+        """Refine the poses of the arrays by the last sounds, wherever these were made.
+
+        The answer is a proposal, which changes nothing.
+        """
         _require(parts, request.known)
         with _refusals():
             proposal = proposals.by_sounds(request.known, request.position_std_m)
@@ -73,7 +76,7 @@ def proposal_routes(parts: Parts) -> APIRouter:
 
     @router.post("/api/v1/set-up/move", response_model=set_up_schema.OneProposal, responses=_ERRORS)
     def post_move(request: set_up_schema.MoveRequest) -> Response:
-        """Propose poses that somebody typed or dragged; changes nothing."""
+        """Propose poses that somebody typed or dragged. The proposal changes nothing."""
         _require(parts, request.arrays)
         poses = {name: (np.array(one.position_m), np.array(one.turn_deg)) for name, one in request.arrays.items()}
         with _refusals():
@@ -105,7 +108,7 @@ def proposal_routes(parts: Parts) -> APIRouter:
 
 
 class _FirstPlace:
-    """The place that is proposed for the first clap; it is computed once for each set-up."""
+    """Computes the place that is proposed for the first clap, once for each set-up."""
 
     def __init__(self) -> None:
         self._known: tuple[Site, list[float] | None] | None = None
@@ -121,7 +124,7 @@ class _FirstPlace:
 
 
 def _require(parts: Parts, names: Iterable[str]) -> None:
-    """Answer 404 if one of the names is no array's."""
+    """Answer 404 if one of the names is not that of an array."""
     known = [spec.name for spec in parts.set_up.site.processed]
     stranger = next((name for name in names if name not in known), None)
     if stranger is not None:
@@ -130,7 +133,7 @@ def _require(parts: Parts, names: Iterable[str]) -> None:
 
 @contextmanager
 def _refusals() -> Iterator[None]:
-    """Answer with the status of what keeps poses from being measured or changed."""
+    """Turn the errors that keep poses from being measured or changed into answers with their status."""
     try:
         yield
     except LookupError as error:

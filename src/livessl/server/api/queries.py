@@ -7,8 +7,11 @@ from collections.abc import Collection, Iterable
 from difflib import get_close_matches
 from typing import Annotated, Final
 
-from fastapi import HTTPException, Request
+import orjson
+from fastapi import HTTPException, Request, Response
 from fastapi.dependencies.models import Dependant
+from fastapi.encoders import jsonable_encoder
+from fastapi.exceptions import RequestValidationError
 from fastapi.routing import APIRoute
 from pydantic import BaseModel, Field, WithJsonSchema
 
@@ -131,6 +134,18 @@ def check_parameters(given: Iterable[str], model: type[BaseModel]) -> None:
 def unprocessable(name: str, what: str, part: str = "query") -> HTTPException:
     """A 422 in FastAPI's form, for a query parameter, or a key of another part, whose value is not valid."""
     return HTTPException(422, [{"type": "value_error", "loc": [part, name], "msg": what}])
+
+
+async def refuse_request(_request: Request, error: Exception) -> Response:
+    """Answer 422 with the faults of a request, without the values if JSON cannot hold them, such as deep nesting."""
+    assert isinstance(error, RequestValidationError)
+    faults = error.errors()
+    try:
+        body = orjson.dumps({"detail": jsonable_encoder(faults)})
+    except (TypeError, RecursionError):
+        told = [{name: fault[name] for name in ("type", "loc", "msg")} for fault in faults]
+        body = orjson.dumps({"detail": jsonable_encoder(told)})
+    return Response(body, 422, media_type="application/json")
 
 
 def instant(name: str, text: str | None) -> int | None:

@@ -1,6 +1,6 @@
 """The events in the order in which they were stored, for clients that must not miss one while they are away.
 
-An event that is stored again, because sound has arrived late, is there once: at the place of its last version.
+An event that is stored again, because sound has arrived late, appears once: where its last version was stored.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from livessl.server.history.tables import life as lives
 
 
 class LogPosition(NamedTuple):
-    """A place in the order of storing.
+    """A place in the order in which events were stored.
 
     Parameters
     ----------
     life : int
-        The number of the history that it is of. In memory, each start of the server begins another one; a database
-        keeps it until it is replaced.
+        Number of the history in which the place is. A history in memory gets another number at each start of the
+        server; one in a database keeps its number until the database is replaced.
     number : int
         Number of the last event before the place.
     """
@@ -37,7 +37,7 @@ class LogPosition(NamedTuple):
 
     @classmethod
     def parse(cls, text: str) -> LogPosition:
-        """Return the position of which `text` is the text form.
+        """Return the position that `str` of it gave as `text`.
 
         Raises
         ------
@@ -46,7 +46,7 @@ class LogPosition(NamedTuple):
         """
         parts = re.fullmatch(r"([0-9a-f]{1,16})-([0-9]{1,18})", text, re.ASCII)
         if parts is None:
-            raise ValueError(f"expected the position of an answer before, got {text!r}")
+            raise ValueError(f"expected the position from an earlier answer, such as 1a-42, got {text!r}")
         return cls(int(parts[1], 16), int(parts[2]))
 
 
@@ -57,12 +57,12 @@ class LogPage(NamedTuple):
     ----------
     rows : sequence of Row
     position : LogPosition
-        The place after them, from which the next page goes on.
+        The place after `rows`; the next page begins there.
     has_more : bool
         Whether more events are stored already.
     is_complete : bool
-        False if events may be missing, because the position asked for is of another history, or too old for one that
-        keeps the newest events only.
+        False if events may be missing: the requested position is of another history, or older than the events that a
+        history of limited size still keeps.
     """
 
     rows: Sequence[Row]
@@ -78,9 +78,9 @@ def log_page(connection: Connection, query: Query, after: LogPosition | None, ke
     ----------
     connection : Connection
     query : Query
-        Filters, and the most events of the page.
+        Filters, and the largest number of events on the page.
     after : LogPosition or None
-        None gives the position of the end, and no event.
+        With None, return the end of the log and no events.
     kept : int or None
         Number of events that the history keeps at most; None if there is no limit.
     """

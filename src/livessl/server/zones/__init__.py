@@ -1,5 +1,6 @@
-"""Zones of a running server: who is inside, what is excluded, and the ones that operators draw.
+"""Zones of a running server: which of them hold a position, what a track does there, and those that operators draw.
 
-`membership` computes who is inside, `presence` what a track does there, and `book` holds the zones that are in force.
-Polygons are checked by `livessl.site.polygon`; nothing here raises an alert.
+`zone_map` answers for all zones at one moment, with the probabilities that `membership` computes. `presence` follows
+tracks, and `book` holds the zones that are in force. Polygons are checked by `livessl.site.polygon`; nothing here
+raises an alert.
 """

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 from livessl.errors import RunError
-from livessl.server.zones.shapes import ZoneMap
+from livessl.server.zones.zone_map import ZoneMap
 from livessl.site.checks import zone_faults
 from livessl.site.models import Site
 from livessl.site.zone_models import Zone

@@ -10,7 +10,7 @@ from typing import Any, Final
 from livessl.clock import utc_text
 from livessl.core.types import Track, TrackState
 from livessl.schema.zones import Change
-from livessl.server.zones.shapes import ZoneMap
+from livessl.server.zones.zone_map import ZoneMap
 
 ENTER: Final = 0.7
 """Probability of a zone from which on a track has entered it."""
