@@ -11,6 +11,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Final
 
 import nats
+from nats.aio.client import Client
 
 from history import Times
 from hub_processes import World, measure_answers
@@ -45,7 +46,7 @@ class Hour:
 
 
 @asynccontextmanager
-async def _connections(url: str) -> AsyncIterator[tuple[nats.NATS, Sequence[JetStreamContext]]]:
+async def _connections(url: str) -> AsyncIterator[tuple[Client, Sequence[JetStreamContext]]]:
     """Connect as the sites do; yield a client, and a stream for each connection."""
     clients = [await nats.connect(url) for _ in range(CONNECTIONS)]
     try:
