@@ -23,6 +23,7 @@ from processor_time import memory_mb
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
+    from nats.aio.client import Client
     from nats.js import JetStreamContext
 
 PARTS: Final = 6
@@ -45,7 +46,7 @@ class Hour:
 
 
 @asynccontextmanager
-async def _connections(url: str) -> AsyncIterator[tuple[nats.NATS, Sequence[JetStreamContext]]]:
+async def _connections(url: str) -> AsyncIterator[tuple[Client, Sequence[JetStreamContext]]]:
     """Connect as the sites do; yield a client, and a stream for each connection."""
     clients = [await nats.connect(url) for _ in range(CONNECTIONS)]
     try:
