@@ -11,6 +11,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Final
 
 import nats
+from nats.aio.client import Client
 
 from history import Times
 from hub_processes import World, measure_answers

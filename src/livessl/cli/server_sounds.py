@@ -5,9 +5,8 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from datetime import datetime
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -20,6 +19,9 @@ from livessl.schema import answers
 from livessl.server.api import set_up_schema
 from livessl.site.load import parse_site
 from livessl.site.models import Site
+
+if TYPE_CHECKING:
+    from datetime import datetime
 
 POLL_S: Final = 0.25
 """Interval, in seconds, at which the server is asked for new sounds."""
@@ -61,7 +63,7 @@ class ServerSounds:
         RunError
             If there is no answer, or none that describes a site.
         """
-        used = {
+        used: dict[str, Any] = {
             "site": True,
             "room": True,
             "grid": {"bounds_m", "spacing_m"},
