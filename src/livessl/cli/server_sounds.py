@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -60,7 +60,7 @@ class ServerSounds:
         RunError
             If there is no answer, or none that describes a site.
         """
-        used = {
+        used: Any = {
             "site": True,
             "room": True,
             "grid": {"bounds_m", "spacing_m"},
