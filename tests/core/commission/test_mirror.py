@@ -29,7 +29,7 @@ def pair(west_deg: float, east_deg: float) -> Arrays:
 def reflected(points_m: FloatArray) -> FloatArray:
     """Points mirrored in the upright plane through both arrays."""
     normal = np.array([-np.sin(np.radians(YAW_DEG)), np.cos(np.radians(YAW_DEG)), 0.0])
-    return points_m - 2.0 * ((points_m - WEST_M) @ normal)[:, None] * normal
+    return np.asarray(points_m - 2.0 * ((points_m - WEST_M) @ normal)[:, None] * normal)
 
 
 def near(rng: np.random.Generator) -> FloatArray:
