@@ -24,7 +24,6 @@ from processor_time import memory_mb
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from nats.aio.client import Client
     from nats.js import JetStreamContext
 
 PARTS: Final = 6
