@@ -235,11 +235,11 @@ def live_table(rows: Sequence[Row]) -> str:
             healthy = sum(not row["degraded"] for row in harmed)
             error_m = float(np.median([row["error_m"] for row in own]))
             named, changes = sum(row["named"] for row in own), max(row["changes"] for row in own)
-            wrong = sum(row["wrong"] for row in own)
-            figures = [len(own), f"{error_m:.2f}", len(harmed), healthy, named, wrong, changes]
+            wrong, ever = sum(row["wrong"] for row in own), sum(row["degraded_after"] is not None for row in own)
+            figures = [len(own), f"{error_m:.2f}", len(harmed), healthy, ever, named, wrong, changes]
             lines.append([fault.name, str(count), *map(str, figures)])
     titles = ["fault", "arrays", "rooms", "median error (m)", "rooms that it harms", "of these all healthy"]
-    return as_markdown([Table([*titles, "named", "wrong", "most changes"], lines)])
+    return as_markdown([Table([*titles, "degraded at any time", "named", "wrong", "most changes"], lines)])
 
 
 def written_into(page: str, name: str, text: str) -> str:

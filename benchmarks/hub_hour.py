@@ -11,6 +11,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Final
 
 import nats
+from nats.aio.client import Client
 
 from history import Times
 from hub_processes import World, measure_answers
@@ -23,6 +24,7 @@ from processor_time import memory_mb
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
+    from nats.aio.client import Client
     from nats.js import JetStreamContext
 
 PARTS: Final = 6
@@ -45,7 +47,7 @@ class Hour:
 
 
 @asynccontextmanager
-async def _connections(url: str) -> AsyncIterator[tuple[nats.NATS, Sequence[JetStreamContext]]]:
+async def _connections(url: str) -> AsyncIterator[tuple[Client, Sequence[JetStreamContext]]]:
     """Connect as the sites do; yield a client, and a stream for each connection."""
     clients = [await nats.connect(url) for _ in range(CONNECTIONS)]
     try:

@@ -154,12 +154,15 @@ def _paced(loads: Sequence[Json]) -> Table:
 def _hour(run: Json) -> list[Block]:
     """Return how it went when sites sent their hour at a multiple of its pace."""
     messages, events, sites = run["messages"], run["events"], run["hour"]
-    days, taken = sites * run["minutes"] / 60 / 24, "all" if run["is_drained"] else "not all"
+    days, size = sites * run["minutes"] / 60 / 24, run["database_bytes"] / 1e6
+    grown = f"and the database by {size:.0f} MB, which is {size / days:.1f} MB a day for a site."
+    if not run["is_drained"]:
+        grown = f"and the database by {size:.0f} MB."
+    taken = "all" if run["is_drained"] else "not all"
     text = (
         f"{run['minutes']} minutes of {sites} sites at {run['times_real']:g} times their pace: {messages} messages "
         f"with {events} events in {run['took_s']:.0f} s, {taken} taken in at the end. "
-        f"The stream grew to {run['stream_bytes'] / 1e6:.0f} MB and the database by {run['database_bytes'] / 1e6:.0f} "
-        f"MB, which is {run['database_bytes'] / 1e6 / days:.1f} MB a day for a site."
+        f"The stream grew to {run['stream_bytes'] / 1e6:.0f} MB {grown}"
     )
     titles = ("until minute", "messages /s", "age of the oldest that waits: median, 95 %, longest", "most that waited",
               *PARTS.values(), "memory of the hub", "slowest kind of answer, 95 %")  # fmt: skip
@@ -229,18 +232,21 @@ def _answers(runs: Sequence[Json], key: str) -> Table:
         return found
 
     kinds = list(answers(runs[-1]))
-    rows = [(kind, *(_answer(answers(run)[kind]) for run in runs)) for kind in kinds]
+    rows = [(kind, *(_answer(answers(run).get(kind)) for run in runs)) for kind in kinds]
     return Table(("answer", *(_count(run, key) for run in runs)), rows)
 
 
-def _answer(times: Json) -> str:
+def _answer(times: Json | None) -> str:
     """Return the time of answers, and in brackets the processor time of hub and database meanwhile."""
+    if times is None:
+        return "–"
     processor = f" ({times['cpu_p95_ms']:.0f})" if times.get("cpu_p95_ms") is not None else ""
     return f"{times['p95_ms']:.0f}{processor}"
 
 
 def _count(run: Json, key: str) -> str:
-    return f"{run[key]} {'stored events' if key == 'history' else 'sites'}"
+    noun = "stored event" if key == "history" else "site"
+    return f"{run[key]} {noun}{'' if run[key] == 1 else 's'}"
 
 
 def _fit(runs: Sequence[Json]) -> list[Block]:

@@ -30,6 +30,25 @@ def finding(fault: str, array: str | None, channel: int | None = None, confidenc
     return Finding(fault, array, channel, Severity.ERROR, confidence, "it is wrong", "mend it")
 
 
+def test_table_of_live_rooms_says_what_harms_what_stays_healthy_and_what_alarms_for_a_time() -> None:
+    def row(seed: int, fault: str, error_m: float, degraded_after: int | None, degraded: list[str]) -> doctor.Row:
+        said = {"named": bool(degraded), "wrong": False, "changes": 2}
+        return {"arrays": 2, "seed": seed, "fault": fault, "error_m": error_m, **said} | {
+            "degraded": degraded,
+            "degraded_after": degraded_after,
+        }
+
+    rows = [row(0, "none", 0.1, None, []), row(1, "none", 0.5, 3, [])]  # the second alarms, and takes it back
+    rows += [row(0, "inverted", 0.4, 3, ["south"]), row(1, "inverted", 0.6, 4, ["south"])]
+    rows += [row(0, "moved by 0.5 m", 0.31, 5, []), row(1, "moved by 0.5 m", np.inf, None, [])]
+    lines = [line.strip("| ").split(" | ") for line in doctor.live_table(rows).splitlines() if line.startswith("| ")]
+    assert [line[2:7] for line in lines[2:]] == [
+        ["2", "0.30", "0", "0", "1"],
+        ["2", "0.50", "1", "0", "2"],
+        ["2", "inf", "2", "2", "1"],
+    ]
+
+
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.name)
 def test_fault_changes_what_it_says_and_nothing_else(fault: Fault) -> None:
     for seed in (1000, 1001):

@@ -132,3 +132,20 @@ def test_what_cannot_be_located_again_is_told(run: Run, tmp_path: Path) -> None:
     missing = run("relocate", tmp_path / "nowhere", "--site", site)
     assert missing.code == 2
     assert "expected a folder of clips: No such file or directory; name it" in missing.err
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--out", "."), "--out .: expected a file that can be written: Is a directory"),
+        (("--out", "nowhere/a.jsonl"), "--out nowhere/a.jsonl: expected a file that can be written: No such file"),
+        (("--method", "no_such_module:Name"), "method: cannot import 'no_such_module' for 'no_such_module:Name'"),
+    ],
+)
+def test_wrong_option_is_one_error_before_all_events(
+    run: Run, site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: tuple[str, str], message: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    done = run("relocate", "--site", site, *options)
+    assert (done.code, done.out, done.err.count("\n")) == (2, "", 1)
+    assert message in done.err

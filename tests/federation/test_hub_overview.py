@@ -176,8 +176,8 @@ def test_events_of_a_site_are_found_by_further_filters(hubs: tuple[Archive, Arch
     sent: dict[str, list[JsonObject]] = {site: [] for site in SITES}
     for number in range(60):
         zones, arrays = rng.sample(ZONES, rng.randint(0, 2)), rng.sample(ARRAYS, rng.randint(0, 2))
-        excluded, status = rng.random() < 0.5, rng.choice(["located", "refused"])
-        made = event(number, zones=zones, arrays=arrays, heard_by=arrays, excluded=excluded, status=status)
+        is_excluded, status = rng.random() < 0.5, rng.choice(["located", "refused"])
+        made = event(number, zones=zones, arrays=arrays, heard_by=arrays, excluded=is_excluded, status=status)
         sent[rng.choice(SITES)].append(made)
     for site, messages in sent.items():
         deliver(taking, site, *messages)

@@ -5,9 +5,8 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from datetime import datetime
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -61,7 +60,7 @@ class ServerSounds:
         RunError
             If there is no answer, or none that describes a site.
         """
-        used = {
+        used: Any = {
             "site": True,
             "room": True,
             "grid": {"bounds_m", "spacing_m"},
@@ -116,21 +115,18 @@ class ServerSounds:
 
     def _after(self, number: int) -> Answer:
         answer = ask_for(set_up_schema.HeardSounds, self._url, f"sounds?after={number}", self._token_file)
-        sounds = [(_ns(one.time_utc), _sound(one)) for one in answer.sounds]
-        return Answer(_ns(answer.now_utc), answer.last, sounds)
+        sounds = [(utc_ns(one.time_utc.isoformat()), _sound(one)) for one in answer.sounds]
+        return Answer(utc_ns(answer.now_utc.isoformat()), answer.last, sounds)
 
     def _described(self) -> answers.Site:
         return ask_for(answers.Site, self._url, "site", self._token_file)
 
 
-def _ns(instant: datetime) -> int:
-    return utc_ns(instant.isoformat())
-
-
 def _sound(one: set_up_schema.HeardSound) -> HeardSound:
     position_m = None if one.position_m is None else np.array(one.position_m, dtype=np.float64)
     observations = tuple(_observation(each) for each in one.observations)
-    return HeardSound(_ns(one.time_utc) / 1e9, position_m, str(one.status), one.reason, observations)
+    start_s = utc_ns(one.time_utc.isoformat()) / 1e9
+    return HeardSound(start_s, position_m, str(one.status), one.reason, observations)
 
 
 def _observation(one: set_up_schema.ObservedDelays) -> Observation:

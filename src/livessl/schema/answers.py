@@ -163,10 +163,10 @@ class Finding(Model):
 
 
 class BlindSpot(Model):
-    """A shift or turn of an array that the last sounds would not show."""
+    """A shift or turn of an array, or a reflection of the whole room, that the last sounds would not show."""
 
     kind: Literal["blind_spot"]
-    fault: Literal["moved", "turned"] = Field(description="Code of the fault that would stay hidden.")
+    fault: Literal["moved", "turned", "mirrored"] = Field(description="Code of the fault that would stay hidden.")
     arrays: list[str] = Field(
         min_length=1,
         description="The array; several if the same fault of each of them would be hidden alike.",
@@ -178,14 +178,16 @@ class BlindSpot(Model):
         examples=[0.8],
     )
     least_deg: float | None = Field(
-        gt=0,
-        description="Smallest turn, in degrees, that these sounds would show in nine of ten cases; null for a shift.",
+        ge=0,
+        description="Smallest turn, in degrees, that these sounds would show in nine of ten cases; of a mirrored room "
+        "the turn that some array would have besides exchanged channels; null for a shift.",
         examples=[None],
     )
     along: list[float] = Field(
         min_length=3,
         max_length=3,
-        description="Direction of the shift, or axis of the turn: a unit vector [x, y, z] in the axes of the room.",
+        description="Direction of the shift, axis of the turn, or normal of the plane of the mirror: a unit "
+        "vector [x, y, z] in the axes of the room.",
         examples=[[0.96, 0.27, 0.0]],
     )
     message: str = Field(

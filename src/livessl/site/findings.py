@@ -31,7 +31,7 @@ _SENTENCES: Final = {
 """Sentence for each type of pydantic error; other types keep pydantic's own."""
 
 MOST_NODES: Final = 1_000_000
-"""Most values of a YAML file once its aliases are replaced by what they stand for: a few lines can stand for billions."""
+"""Most values of a YAML file with its aliases replaced by what they stand for: a few lines can stand for billions."""
 
 MOST_DIGITS: Final = 30
 """Most characters of a whole number; Python refuses to print numbers of thousands of digits."""

@@ -23,7 +23,15 @@ from livessl.lab.evaluate.noise_kinds import FROM_ONE_PLACE, KINDS, make_noise
 from livessl.lab.evaluate.noise_report import write_noise_report
 from livessl.lab.evaluate.noise_rooms import NOISE_ROOMS
 from livessl.lab.evaluate.noise_sounds import OTHER_SOUNDS
-from livessl.lab.evaluate.noise_summary import ALL, MOST_WRONG, below_standard, reliability, summary, too_wrong
+from livessl.lab.evaluate.noise_summary import (
+    ALL,
+    MOST_WRONG,
+    below_standard,
+    reliability,
+    summary,
+    too_wrong,
+    wrong_positions,
+)
 from livessl.lab.evaluate.scenarios import HALVES
 from livessl.lab.evaluate.statistics import wilson
 from livessl.simulation.room import absorption
@@ -140,6 +148,11 @@ def test_cells_that_fall_short_are_named(columns: Columns) -> None:
     (cell,) = too_wrong(summary(far))
     assert (cell["noise"], cell["snr_db"]) == ("fan", 20.0)
     assert cell["wrong"] > MOST_WRONG
+    count = len(CLASSES)
+    expected = {"all": count, "within_1_m": 0, "at_noise": 0, "in_a_quarter": count}
+    assert wrong_positions(far | {"to_noise_m": np.full(len(ours), 0.6)}) == expected
+    nearer = far | {"error_m": np.where(ours, 0.7, 0.1), "to_noise_m": np.full(len(ours), 0.4)}
+    assert wrong_positions(nearer) == dict.fromkeys(expected, count)
     refused = right | {"located": ~ours}
     assert not too_wrong(summary(refused))
     assert [row["noise"] for row in below_standard(summary(refused))] == ["fan"]

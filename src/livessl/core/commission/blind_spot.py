@@ -22,13 +22,14 @@ class BlindSpot:
     Parameters
     ----------
     fault : str
-        `moved` or `turned`.
+        `moved`, `turned` or `mirrored`.
     arrays : tuple of str
         The array; several if the same fault of each of them would be hidden alike.
     least : float
-        Smallest shift, in metres, or turn, in degrees, that the sounds would show in nine of ten cases.
+        Smallest shift, in metres, or turn, in degrees, that the sounds would show in nine of ten cases. Of a mirrored
+        room the turn, in degrees, that some array would have besides exchanged channels.
     along : (3,) tuple of float
-        Unit vector of the shift, or of the axis of the turn.
+        Unit vector of the shift, of the axis of the turn, or at right angles to the plane of the mirror.
     """
 
     fault: str
@@ -41,6 +42,12 @@ class BlindSpot:
         """What the sounds cannot show, in one sentence without a full stop."""
         names = " or ".join(repr(name) for name in self.arrays)
         along = ", ".join(f"{x:.2f}" for x in self.along)
+        if self.fault == "mirrored":
+            return (
+                "these sounds cannot show whether all places are mirrored in the plane through the arrays, at right "
+                f"angles to ({along}), because channels are exchanged at {' and '.join(repr(a) for a in self.arrays)}, "
+                f"and arrays are turned by up to {self.least:.0f} degrees"
+            )
         if self.fault == "turned":
             size = f" by less than {self.least:.0f} degrees" if self.least < MOST_TURN_DEG else ""
             how = f"turned{size} about ({along})"

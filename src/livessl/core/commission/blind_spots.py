@@ -1,4 +1,4 @@
-"""Says which shifts and turns of an array some sounds at unknown places could not have shown.
+"""Says which faults of poses some sounds at unknown places could not have shown: shifts, turns, and a mirrored room.
 
 Two arrays whose lines of sight to a sound still meet after one of them was moved receive nothing that contradicts the
 site file: the place of the sound, which nobody knows, explains it. How much of a fault remains visible follows from the
@@ -17,6 +17,7 @@ from livessl.core.commission.blind_spot import BlindSpot
 from livessl.core.commission.diagnosis import most_telling, of_sounds
 from livessl.core.commission.finding import LEAST_SOUNDS
 from livessl.core.commission.judge import COSTS, least_gain
+from livessl.core.commission.mirror import mirrored
 from livessl.core.commission.places import Delays, Microphones, PlaceSearch
 from livessl.core.commission.set_up import Known, SetUp
 from livessl.core.commission.tolerance import Fit
@@ -42,7 +43,7 @@ _LEAST_SEEN: Final = 1e-12
 def blind_spots(
     microphones: Microphones, delays: Delays, bounds_m: FloatArray, c_m_s: float, known: Known
 ) -> tuple[BlindSpot, ...]:
-    """Return the shifts and turns that sounds at unknown places hide most, of each array.
+    """Return what sounds at unknown places hide: a reflection of the room, and of each array its shifts and turns.
 
     Parameters
     ----------
@@ -60,8 +61,9 @@ def blind_spots(
     Returns
     -------
     tuple of BlindSpot
-        Those that are larger than `MOST_HIDDEN_M` and `MOST_HIDDEN_DEG`; empty with fewer than two arrays or three
-        sounds, which show no pose at all.
+        The reflection first (`livessl.core.commission.mirror`), then the shifts and turns that are larger than
+        `MOST_HIDDEN_M` and `MOST_HIDDEN_DEG`; empty with fewer than two arrays or three sounds, which show no pose at
+        all.
     """
     if len(delays) < 2 or len(next(iter(delays.values()))) < LEAST_SOUNDS:
         return ()
@@ -82,7 +84,9 @@ def blind_spots(
             found[fault].append(_weakest(fault, name, seen[np.ix_(columns, columns)] / np.outer(std, std), len(delays)))
     most = {"moved": MOST_HIDDEN_M, "turned": MOST_HIDDEN_DEG}
     hidden = {fault: [one for one in spots if one.least > most[fault]] for fault, spots in found.items()}
-    return tuple(spot for spots in hidden.values() for spot in _joined(spots))
+    reflection = mirrored(microphones, places_m, bounds_m)
+    of_poses = [spot for spots in hidden.values() for spot in _joined(spots)]
+    return (*(() if reflection is None else (reflection,)), *of_poses)
 
 
 def _weakest(fault: str, array: str, seen: FloatArray, arrays: int) -> BlindSpot:

@@ -26,6 +26,7 @@ from livessl.lab.evaluate.noise_summary import (
     reliability,
     summary,
     too_wrong,
+    wrong_positions,
 )
 from livessl.lab.evaluate.scenarios import HALVES, NOISE
 from livessl.lab.evaluate.statistics import write_csv
@@ -45,6 +46,7 @@ def write_noise_report(out: Path) -> list[Path]:
 
 
 def _blocks(columns: Columns, rows: Sequence[SummaryRow], settings: Mapping[str, Any]) -> list[Block]:
+    wrong = wrong_positions(columns)
     levels = ",".join(f"{snr_db:g}" for snr_db in settings["snrs_db"])
     return [
         Heading(1, "Localization in the noise that rooms have"),
@@ -62,6 +64,9 @@ def _blocks(columns: Columns, rows: Sequence[SummaryRow], settings: Mapping[str,
         Table(("noise", "SNR", *_TITLES), [_cells(row, "noise", "snr_db") for row in rows if row["noise"] != ALL]),
         f"More than {100 * MOST_WRONG:g} % of the positions of `onset` are wrong in: {_named(too_wrong(rows))}. It has "
         f"fewer right sounds than the interval of `srp-phat` begins with in: {_named(below_standard(rows))}.",
+        f"Of the {wrong['all']} wrong positions of `onset` {wrong['within_1_m']} are less than 1 m off, and "
+        f"{wrong['at_noise']} within {NEAR_M:g} m of a noise source. {wrong['in_a_quarter']} of them belong to the "
+        "quarter of the scenes that has most of them.",
         *(block for name in _PART_TITLES for block in _by(rows, name)),
         *_rooms_and_levels(rows),
         *_others(rows),
@@ -91,7 +96,7 @@ def _rooms_and_levels(rows: Sequence[SummaryRow]) -> list[Block]:
             _share(row, "right"),
             _share(row, "wrong") if row["located"] else "",
             f"{100 * row['withheld']:.0f} %",
-            f"{100 * (1.0 - row['located'] - row['withheld']):.0f} %",
+            f"{max(0.0, 100 * (1.0 - row['located'] - row['withheld'])):.0f} %",
         )
         for row in here
     ]

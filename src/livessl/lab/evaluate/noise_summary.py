@@ -34,8 +34,8 @@ def summary(columns: Columns) -> list[SummaryRow]:
     `right` is the share of all sounds that are located within `NEAR_M`; `wrong` is the share of the located ones that
     are further off, and `at_noise` the share of those within `NEAR_M` of a noise source; `withheld` is the share of all
     sounds whose best place is within `NEAR_M` but not reported as a position. Each room has a row at each level, too.
-    Intervals are 95 % intervals
-    by Wilson, as if sounds were independent. The sounds of `OTHER_SOUNDS` have rows of their own alone.
+    Intervals are 95 % intervals by Wilson, as if sounds were independent. The sounds of `OTHER_SOUNDS` have rows of
+    their own alone.
     """
     levels_db = sorted(set(columns["snr_db"].tolist()), reverse=True)
     kinds = [kind for kind in KINDS if (columns["noise"] == kind).any()]
@@ -106,6 +106,24 @@ def below_standard(rows: Sequence[SummaryRow]) -> list[SummaryRow]:
 
 def _cells(rows: Sequence[SummaryRow], method: str) -> list[SummaryRow]:
     return [row for row in rows if row["noise"] != ALL and row["method"] == method]
+
+
+def wrong_positions(columns: Columns) -> dict[str, int]:
+    """Count the wrong positions of `onset`: `all`, those less than 1 m off, `at_noise`, and those `in_a_quarter`.
+
+    `in_a_quarter` counts those of the quarter of the scenes that has most of them: sounds of one scene are not
+    independent.
+    """
+    wrong = (columns["method"] == OURS) & ~np.isin(columns["sound"], list(OTHER_SOUNDS))
+    scenes = len(set(columns["position"].tolist()))
+    wrong &= columns["located"] & (columns["error_m"] > NEAR_M)
+    each = np.unique(columns["position"][wrong], return_counts=True)[1]
+    return {
+        "all": int(wrong.sum()),
+        "within_1_m": int((columns["error_m"][wrong] < 1.0).sum()),
+        "at_noise": int((columns["to_noise_m"][wrong].astype(np.float64) <= NEAR_M).sum()),
+        "in_a_quarter": int(np.sort(each)[::-1][: -(-scenes // 4)].sum()),
+    }
 
 
 def reliability(columns: Columns) -> dict[str, list[Mapping[str, float]]]:

@@ -82,7 +82,7 @@ def _privacy(site: Site) -> JsonObject:
 
 
 def _blind_spot(spot: BlindSpot) -> JsonObject:
-    is_turn = spot.fault == "turned"
+    is_turn = spot.fault != "moved"
     return {
         "kind": "blind_spot",
         "fault": spot.fault,
