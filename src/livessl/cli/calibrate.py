@@ -155,6 +155,8 @@ def run(arguments: argparse.Namespace) -> int:
         return OK
     if len(getattr(arguments, "at", [])) > MOST_CLAPS:
         raise UseError(f"--at: expected {MOST_CLAPS} places at most, got {len(arguments.at)}")
+    if getattr(arguments, "write", None) is not None:
+        calibration_file.refuse_foreign_file(arguments)
     return int(arguments.act(arguments))
 
 

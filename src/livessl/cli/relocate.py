@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from livessl.cli import argument, progress
 from livessl.cli.exits import FAILED, OK
@@ -21,6 +21,10 @@ if TYPE_CHECKING:
     from livessl.server.clips.folder import ClipReader
     from livessl.server.clips.relocate_many import Task
     from livessl.site.models import Site
+
+
+BEGINNING: Final = b'{"kind": "relocation"'
+"""Beginning of each line in a file of answers."""
 
 
 def add_arguments(parser: Any) -> None:
@@ -150,7 +154,7 @@ def _sorted_out(path: Path, task: Task, wanted: frozenset[str]) -> set[str]:
     known: set[str] = set()
     kept: list[bytes] = []
     for line in path.read_bytes().splitlines(keepends=True):
-        if not line.endswith(b"\n"):  # a command that was killed has left it; it is written again
+        if not line.endswith(b"\n") and is_begun(line):  # a command that was killed has left it; it is written again
             break
         event_id, is_located = _held(path, line, task)
         if is_located:
@@ -161,6 +165,11 @@ def _sorted_out(path: Path, task: Task, wanted: frozenset[str]) -> set[str]:
     fresh.write_bytes(b"".join(kept))
     fresh.replace(path)
     return known
+
+
+def is_begun(line: bytes) -> bool:
+    """Return whether bytes are the beginning of an answer, and not another file without an end of line."""
+    return line[: len(BEGINNING)] == BEGINNING[: len(line)]
 
 
 def _held(path: Path, line: bytes, task: Task) -> tuple[str, bool]:

@@ -82,6 +82,15 @@ def write_session(directory: Path, site: Site, pieces: list[Piece]) -> None:
     _replace(directory / SESSION_FILE, yaml.safe_dump(described, sort_keys=False))
 
 
+def holds_copied_site(directory: Path) -> bool:
+    """Return whether the site file in a folder is a session's copy, and not one with comments or another layout."""
+    try:
+        text = (directory / SITE_FILE).read_text(encoding="utf-8")
+        return bool(text == _site_yaml(read_yaml(text)))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError):
+        return False
+
+
 def _replace(path: Path, text: str) -> None:
     part = path.with_name(path.name + ".part")
     try:
@@ -140,4 +149,8 @@ def site_text(site: Site) -> str:
         data["arrays"][spec.name] = array
     for name, node in site.nodes.items():
         data["nodes"][name]["device"]["type"] = node.device.type
-    return yaml.safe_dump(data, sort_keys=False, default_flow_style=None)
+    return _site_yaml(data)
+
+
+def _site_yaml(data: Any) -> str:
+    return str(yaml.safe_dump(data, sort_keys=False, default_flow_style=None))
