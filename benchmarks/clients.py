@@ -113,7 +113,7 @@ def _serve(control: Connection, updates_per_s: float) -> None:
         while not ended.is_set():
             number += 1
             # the entry point of the engine's results
-            server._publish(_update(number, clock))
+            server.publish(_update(number, clock))
             due_ns = begun_ns + round(number / updates_per_s * 1e9)
             ended.wait(max(0.0, (due_ns - time.monotonic_ns()) / 1e9))
 

@@ -30,7 +30,7 @@ from peers import room_grid
 COUNTS: Final = (2, 3, 4, 6, 8)
 SPACINGS_M: Final = (0.1, 0.05)
 SOUNDS: Final = 6
-"""Of each kind: with all else 180 maps."""
+"""Sounds of each kind: with three kinds, five numbers of arrays and two grids they make 180 maps."""
 
 
 def compare(
@@ -87,7 +87,7 @@ def main() -> int:
     """Compare, write exactness.json, and fail unless all results are the same."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")
-    parser.add_argument("--sounds", type=int, default=SOUNDS, help=f"of each kind (default {SOUNDS}: 180 maps)")
+    parser.add_argument("--sounds", type=int, default=SOUNDS, help=f"sounds of each kind (default {SOUNDS}: 180 maps)")
     arguments = parser.parse_args()
     about = machine.describe()
     with threadpool_limits(limits=1), counted("maps", "sound") as show:

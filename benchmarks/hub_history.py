@@ -238,9 +238,11 @@ def measure_history(
 ) -> Iterator[JsonObject]:
     """Fill a hub's database step by step, and yield the answers of a hub at each."""
     with ExitStack() as stack:
-        place = str(folder / "hub.sqlite")
+        place, filled = str(folder / "hub.sqlite"), None
         if not sqlite:
-            place = stack.enter_context(running_postgresql({**SETTINGS, **FILLING})).url()
+            postgresql = stack.enter_context(running_postgresql({**SETTINGS, **FILLING}))
+            place = postgresql.url()
+            filled = postgresql, place
         stored = 0
         for count in sorted(counts):
             begun = time.perf_counter()
@@ -249,9 +251,9 @@ def measure_history(
             if not stored:
                 _introduce(place, sites)
             stored = count
-            with running_hub_process(folder, sqlite=sqlite, database=place) as world:
-                measure_answers(world.hub.url, sites, 0.0, count)  # the first look reads from disk
-                answers = measure_answers(world.hub.url, sites, seconds, count)
+            with running_hub_process(folder, sqlite, filled) as world:
+                measure_answers(world, sites, 0.0, count)  # the first look reads from disk
+                answers = measure_answers(world, sites, seconds, count)
                 yield {
                     "history": count,
                     "sites": sites,

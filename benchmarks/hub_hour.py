@@ -94,7 +94,7 @@ async def _measure_part(world: World, progress: Progress, sites: Sequence[Simula
     progress.lags_s.clear()
     progress.most_waiting = 0
     before, begun, sent = world.processor_s(), time.perf_counter(), len(progress.sent)
-    asking = asyncio.create_task(asyncio.to_thread(measure_answers, world.hub.url, hour.sites, hour.part_s))
+    asking = asyncio.create_task(asyncio.to_thread(measure_answers, world, hour.sites, hour.part_s))
     await publish_paced(progress, sites, hour.part_s, hour.times_real)
     after, passed_s = world.processor_s(), time.perf_counter() - begun
     published = len(progress.sent) - sent

@@ -103,7 +103,7 @@ async def measure_paced(world: World, demand: Demand, progress: Progress, sites:
     async with meanwhile(progress.watch):
         rate = await publish_paced(progress, sites, demand.paced_s)
     after, passed_s = world.processor_s(), time.perf_counter() - begun
-    asking = asyncio.create_task(asyncio.to_thread(measure_answers, world.hub.url, demand.sites, demand.paced_s))
+    asking = asyncio.create_task(asyncio.to_thread(measure_answers, world, demand.sites, demand.paced_s))
     await publish_paced(progress, sites, demand.paced_s)
     return {
         "messages_per_s": rate,

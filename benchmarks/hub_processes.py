@@ -22,7 +22,7 @@ from livessl.lab.processes import end, wait_until_ready
 from livessl.server.api.encode import JsonObject
 from nats_servers import NatsServer, running_nats
 from postgresql import SETTINGS, PostgreSQL, running_postgresql
-from processor_time import processor_s
+from processor_time import processor_s, running_ns
 from small_site import wait_until
 
 REQUEST_S: Final = 0.05
@@ -47,6 +47,10 @@ class World:
         pids = {"hub": self.hub.process.pid, "nats": self.server.pid, "database": database}
         return {name: processor_s(pid) for name, pid in pids.items() if pid}
 
+    def running_ns(self) -> dict[int, int]:
+        """Return the processor time so far, in nanoseconds, of each process of hub and database (`running_ns`)."""
+        return running_ns(self.hub.process.pid) | (running_ns(self.postgresql.pid) if self.postgresql else {})
+
     def stored_bytes(self) -> int:
         """Return the size of the database."""
         if self.postgresql is None:
@@ -59,49 +63,54 @@ class World:
 
 
 @contextmanager
-def running_hub_process(folder: Path, sqlite: bool, database: str | None = None) -> Iterator[World]:
-    """Run one NATS server and one hub, and PostgreSQL unless there is a database or SQLite is wanted."""
+def running_hub_process(folder: Path, sqlite: bool, filled: tuple[PostgreSQL, str] | None = None) -> Iterator[World]:
+    """Run one NATS server and one hub, and PostgreSQL unless a filled one is given by its URL or SQLite is wanted."""
     with ExitStack() as stack:
         (folder / "nats").mkdir(exist_ok=True)
         server = stack.enter_context(running_nats(folder / "nats"))
-        postgresql = None
-        if database is None and not sqlite:
+        postgresql, database = (None, str(folder / "hub.sqlite")) if filled is None else filled
+        if filled is None and not sqlite:
             settings = {**SETTINGS, "fsync": "on", "full_page_writes": "on", "shared_buffers": "128MB"}
             postgresql = stack.enter_context(running_postgresql(settings))
             database = postgresql.url()
-        hub = HubProcess(folder, 0, database or str(folder / "hub.sqlite"), [server.url], replicas=1)
+        hub = HubProcess(folder, 0, database, [server.url], replicas=1)
         stack.callback(lambda: end([hub.process]))
         wait_until_ready(hub.url, [hub.process], SystemClock())
         wait_until(hub.takes_in, "a hub that takes messages in")
         yield World(server, hub, postgresql, folder)
 
 
-def measure_answers(url: str, sites: int, seconds: float, stored: int | None = None) -> JsonObject:
+def measure_answers(world: World, sites: int, seconds: float, stored: int | None = None) -> JsonObject:
     """Return how long answers of the API take, asked for some seconds in turns.
+
+    The processor time of hub and database during each is measured as well. It hardly depends on what else the machine
+    does, but it includes what both do besides.
 
     Parameters
     ----------
-    url : str
-        The hub's address.
+    world : World
     sites : int
     seconds : float
     stored : int or None
-        Number of events of a filled history, in which events are searched by further filters; None for any other one.
+        Number of events of a filled history, in which events are searched by further filters. None for any other one:
+        then all sites and metrics are asked for as well, which do not depend on it.
     """
     rng = random.Random(6)
-    requests = {**_state_requests(), **_site_requests(rng, sites)}
-    if stored is not None:
-        requests |= _search_requests(rng, sites, stored)
-    times: dict[str, list[float]] = {kind: [] for kind in requests}
-    until = time.perf_counter() + seconds
-    with httpx.Client(base_url=url, timeout=120) as client:
-        while time.perf_counter() < until or len(times["metrics"]) < 2:
+    further = _state_requests() if stored is None else _search_requests(rng, sites, stored)
+    requests = {**_site_requests(rng, sites), **further}
+    times: dict[str, tuple[list[float], list[float]]] = {kind: ([], []) for kind in requests}
+    until, rounds = time.perf_counter() + seconds, 0
+    with httpx.Client(base_url=world.hub.url, timeout=120) as client:
+        while time.perf_counter() < until or rounds < 2:
+            rounds += 1
             for kind, request in requests.items():
-                asked, begun = request(), time.perf_counter()
+                asked, before, begun = request(), world.running_ns(), time.perf_counter()
                 client.get(asked).raise_for_status()
-                times[kind].append(time.perf_counter() - begun)
+                passed_s, after = time.perf_counter() - begun, world.running_ns()
+                times[kind][0].append(passed_s)
+                times[kind][1].append(sum(ns - before.get(pid, 0) for pid, ns in after.items()) / 1e9)
                 time.sleep(REQUEST_S)
-    return {kind: asdict(Times.of(each)) for kind, each in times.items()}
+    return {kind: asdict(Times.of(*each)) for kind, each in times.items()}
 
 
 def _state_requests() -> Requests:

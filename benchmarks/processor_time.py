@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from pathlib import Path
 
 
@@ -24,6 +25,21 @@ def processor_s(root: int) -> float:
         family |= more
         more = {process for process, parent in parents.items() if parent in more} - family
     return sum(times.get(process, 0.0) for process in family)
+
+
+def running_ns(root: int) -> dict[int, int]:
+    """Return the processor time so far, in nanoseconds, of a process and of its children, each by its process id.
+
+    It is counted to the nanosecond, so that the cost of a single request can be measured, unlike by `processor_s`.
+    """
+    children = Path(f"/proc/{root}/task/{root}/children").read_text(encoding="utf-8").split()
+    found = {}
+    for pid in (root, *map(int, children)):
+        found[pid] = 0
+        for task in Path(f"/proc/{pid}/task").glob("*/schedstat"):
+            with suppress(OSError):  # it has just ended
+                found[pid] += int(task.read_text(encoding="utf-8").split()[0])
+    return found
 
 
 def memory_mb(process: int, field: str = "VmRSS") -> float:

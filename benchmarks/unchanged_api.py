@@ -20,14 +20,15 @@ from websockets.sync.client import connect
 
 from unchanged_trees import Keys, ProbeError, Tree, keys_of, load_json
 
-READY_S: Final = 120.0
-"""Longest wait for a server, in seconds; its first start compiles."""
+READY_S: Final = 900.0
+"""Longest wait for a server or its messages, in seconds. Its first start compiles, which takes a minute of processor
+time, and many times longer at a low priority beside other work. Only a hang reaches this."""
 
-QUIET_S: Final = 1.0
+QUIET_S: Final = 2.0
 """The server has taken in a session when its list of events has not grown for so long, in seconds."""
 
-REQUEST_S: Final = 10.0
-"""Longest wait for one answer of a server, in seconds."""
+REQUEST_S: Final = 100.0
+"""Longest wait for one answer of a server, and for its end, in seconds; only a hang reaches this."""
 
 KINDS: Final = {"hello", "update", "event", "track", "arrays"}
 """Kinds of live messages that a session brings about."""

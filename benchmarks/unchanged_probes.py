@@ -201,17 +201,24 @@ def commands(pair: Pair, _: Options) -> Finding:
     return Finding(f"{len(base)} commands, options and choices", missing(base, head))
 
 
-def _described(tree: Tree, folder: Path) -> Iterator[str]:
-    def words(*command: str) -> set[str]:
-        text = tree.must(tree.livessl(*command, "--help", folder=folder), " ".join((*command, "--help"))).out.decode()
-        listed = re.findall(r"^ {2,6}([a-z][a-z-]*)  ", text, re.MULTILINE)
-        chosen = [word for choices in re.findall(r"\{([^}]+)\}", text) for word in choices.split(",")]
-        return {*listed, *chosen, *re.findall(r"--[a-z][a-z0-9-]*", text)}
+def _described(tree: Tree, folder: Path, *command: str) -> Iterator[str]:
+    """Yield what the help of a command names, and that of the commands below it."""
+    text = tree.must(tree.livessl(*command, "--help", folder=folder), " ".join((*command, "--help"))).out.decode()
+    chosen = [word for choices in re.findall(r"\{([^}]+)\}", text) for word in choices.split(",")]
+    below = commands_of(text)
+    for word in {*below, *chosen, *re.findall(r"--[a-z][a-z0-9-]*", text)}:
+        yield " ".join((*command, word))
+    for name in below:
+        yield from _described(tree, folder, *command, name)
 
-    top = words()
-    yield from top
-    for command in sorted(word for word in top if not word.startswith("-")):
-        yield from (f"{command} {word}" for word in words(command))
+
+def commands_of(text: str) -> list[str]:
+    """Return the commands that argparse's help lists: below a line with nothing but their name for all or their choice.
+
+    Choices of an option, such as `--log {text,json}`, are no commands.
+    """
+    lists = re.findall(r"^ {2}(?:[A-Z]+|\{[^}\s]+\})\n((?:^ {4}.*\n?)+)", text, re.MULTILINE)
+    return [name for listed in lists for name in re.findall(r"^ {4}([a-z][a-z0-9-]*)(?:  |$)", listed, re.MULTILINE)]
 
 
 def api(pair: Pair, _: Options) -> Finding:

@@ -68,7 +68,7 @@ class SiteDesk:
 
     def report_arrays(self) -> None:
         """Publish the states of the arrays."""
-        self.link.take({"kind": "arrays", "now_utc": "2026-01-01T00:00:00Z", "arrays": self.arrays()})
+        self.link.messages.take({"kind": "arrays", "now_utc": "2026-01-01T00:00:00Z", "arrays": self.arrays()})
 
 
 @contextmanager

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from functools import cache
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any, Final
 
+from clip_desk import ClipDesk
 from livessl.clock import UnpacedClock
 from livessl.core.stream.clock_offsets import ClockOffsets
-from livessl.core.stream.load_policy import NOTHING_SHED
 from livessl.core.types import FRAME_NS, Event, Message
 from livessl.recordings.assign import AssignedRecording, make_pipelines
 from livessl.recordings.play import paced_messages
@@ -18,7 +17,7 @@ from livessl.site.build.fusion import make_fusion
 from livessl.site.models import Site
 from small_site import scene_recordings, site_of
 
-CLIPS: dict[str, Any] = {"folder": "clips", "pre_s": 1.0, "post_s": 0.5, "enhanced": False}
+CLIPS: Final[dict[str, Any]] = {"folder": "clips", "pre_s": 1.0, "post_s": 0.5, "enhanced": False}
 START_NS = 1_767_225_600_000_000_000
 
 
@@ -66,17 +65,13 @@ def clipped(
     directory: Path, taken: list[Message], offsets: ClockOffsets | None = None, found: list[Event] | None = None
 ) -> Clips:
     """Clips of the scene's events, or of others that were found in the messages, written."""
-    site = site_of({"server.clips": CLIPS}, directory)
-    assert site.server.clips is not None
-    clock: Any = SimpleNamespace(now_ns=lambda: START_NS, monotonic_ns=lambda: clock.ns, ns=0)
-    idle = cast(Any, SimpleNamespace(is_replay=False, relief=NOTHING_SHED))
-    clips = Clips(site, site.server.clips, clock, idle, idle)
-    clips.take(taken, None)
+    desk = ClipDesk(directory, START_NS, **CLIPS)
+    desk.offsets = Offsets({}, 0.0) if offsets is None else offsets
+    desk.clips.take(taken, None)
     found = events() if found is None else found
-    for event in found:
-        clips.take_final(event, Offsets({}, 0.0) if offsets is None else offsets)
-    clock.ns = 60_000_000_000
-    while clips.work():
-        pass
+    desk.finish(*found)
+    desk.clock.ns += 60_000_000_000
+    desk.work()
+    clips = desk.clips
     assert clips.counts.written == len(found) > 0
     return clips

@@ -72,12 +72,52 @@ def test_a_link_to_a_missing_file_or_heading_is_found(tmp_path: Path) -> None:
     assert broken_links(page) == ["gone.md", "other.md#gone", "#gone"]
 
 
+def broken_rows(path: Path) -> list[str]:
+    """Rows that Markdown would show as plain text, as no table begins above them, or with cells of another number."""
+    text = re.sub(r"^```.*?^```", "", path.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    broken = []
+    for rows in re.findall(r"(?:^\|.*\n?)+", text, re.MULTILINE):
+        lines = rows.splitlines()
+        widths = [len(re.findall(r"(?<!\\)\|", line)) for line in lines]
+        has_head = len(lines) > 1 and re.fullmatch(r"[-| :]+", lines[1]) is not None
+        broken += [line for line, width in zip(lines, widths, strict=True) if not has_head or width != widths[0]]
+    return broken
+
+
+@pytest.mark.parametrize("path", documents(), ids=lambda path: str(path.relative_to(ROOT)))
+def test_tables_of_a_document_are_shown_as_tables(path: Path) -> None:
+    assert broken_rows(path) == []
+
+
+def test_a_row_without_a_table_and_a_row_of_another_width_are_found(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text("| a | b |\n|---|---|\n| `x \\| y` | 1 |\n| 2 |\n\n| lost | row |\n", encoding="utf-8")
+    assert broken_rows(page) == ["| 2 |", "| lost | row |"]
+
+
+def test_the_index_links_every_document() -> None:
+    index = ROOT / "docs" / "README.md"
+    linked = {name.partition("#")[0] for name in LINK.findall(index.read_text(encoding="utf-8"))}
+    pages = {path.name for path in index.parent.glob("*.md")} - {"README.md"}
+    assert len(pages) > 15
+    assert pages - linked == set()
+
+
 @pytest.mark.parametrize("name", ["README.md", "CONTRIBUTING.md"])
 def test_files_that_tables_name_exist(name: str) -> None:
     rows = TABLE_ROW.findall((ROOT / name).read_text(encoding="utf-8"))
     names = [found for row in rows for found in FILE_NAME.findall(row)]
     assert len(names) > 20
     assert [found for found in names if not any((source / found).exists() for source in SOURCES)] == []
+
+
+def test_the_readme_names_every_module_and_package_at_the_root() -> None:
+    rows = TABLE_ROW.findall((ROOT / "README.md").read_text(encoding="utf-8"))
+    named = {name.removeprefix("src/livessl/").rstrip("/") for row in rows for name in re.findall(r"`([\w./-]+)`", row)}
+    below = (ROOT / "src" / "livessl").iterdir()
+    there = {path.name for path in below if path.suffix == ".py" or (path / "__init__.py").exists()}
+    assert len(there) > 20
+    assert there - named - {"__init__.py", "__main__.py"} == set()
 
 
 def test_tests_that_a_table_names_exist() -> None:

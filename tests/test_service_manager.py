@@ -251,19 +251,21 @@ def test_hung_fusion_gives_no_sign_of_life_although_http_answers(
         assert manager.said[-2:] == ["STOPPING=1", "STATUS=stopping"]
 
 
-def test_database_that_is_slow_holds_up_neither_signs_of_life_nor_http(tmp_path: Path) -> None:
+def test_database_that_is_slow_holds_up_neither_signs_of_life_nor_http(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The condition is asked from the outbox of the alerts, among others, which a disk may hold for seconds."""
+    asked, held = Flag(), Flag()
+
+    def slow(*_: object) -> str:
+        asked.set()
+        held.wait(HANG_S)
+        raise OSError("the disk is gone")
+
+    monkeypatch.setattr("livessl.server.sign_of_life.condition", slow)
     with listening(tmp_path, reads=True) as manager:
         service = ServiceManager(SystemClock(), manager.address, 4_000)
         with running_server(site_of(), service=service) as server:
-            asked, held = Flag(), Flag()
-
-            def slow() -> str:
-                asked.set()
-                held.wait(HANG_S)
-                raise OSError("the disk is gone")
-
-            server._sign_of_life._describe = slow  # type: ignore[method-assign]
             assert asked.wait(HANG_S)
             before = manager.count("WATCHDOG=1")
             wait_until(lambda: manager.count("WATCHDOG=1") > before + 3, "signs of life")

@@ -49,6 +49,20 @@ def test_changed_byte_of_a_binary_is_reported_in_hexadecimal_digits() -> None:
     ]
 
 
+@pytest.mark.parametrize("heading", ["COMMAND", "{serve,support-bundle}"])
+def test_commands_are_found_in_a_help_and_choices_of_options_are_none(heading: str) -> None:
+    text = (
+        "usage: livessl [--log {text,json}] COMMAND ...\n\noptions:\n  --log {text,json}  form of the log lines\n"
+        f"\ncommands:\n  {heading}\n    serve            run the\n                     server\n"
+        "    support-bundle   collect what helps\n\nsee also: docs\n"
+    )
+    assert unchanged_probes.commands_of(text) == ["serve", "support-bundle"]
+
+
+def test_help_of_a_command_without_others_lists_none() -> None:
+    assert unchanged_probes.commands_of("positional arguments:\n  FILE      site file\n    more of it\n") == []
+
+
 def test_only_the_words_of_a_reason_may_change() -> None:
     one = b'{"position_m": [1.0], "reason": "a \\"b\\" c", "zones": []}'
     reworded, none = one.replace(b" c", b" d"), one.replace(b'"a \\"b\\" c"', b"null")

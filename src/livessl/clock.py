@@ -10,6 +10,9 @@ from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 LONGEST_SLEEP_S: Final = 0.1
 """Longest single sleep, in seconds, so that waiting code can keep its connection alive and notice a stop request."""
 
+_FARTHEST_NS: Final = 269 * 365 * 86_400 * 10**9
+"""Greatest distance of a recording from 1970, in nanoseconds: times are sent in 64 bits, which hold 292 years."""
+
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
@@ -92,6 +95,20 @@ def utc_text(time_ns: int) -> str:
     """Return an instant as RFC 3339 text in UTC with microseconds: `2026-01-31T12:00:00.050000Z`."""
     instant = _EPOCH + timedelta(microseconds=time_ns // 1000)
     return instant.isoformat(timespec="microseconds").replace("+00:00", "Z")
+
+
+def recordable_ns(text: str) -> int:
+    """Return the nanoseconds since the epoch of an RFC 3339 text at which a recording can begin.
+
+    Raises
+    ------
+    ValueError
+        If the text is not an instant with an offset from UTC, or too far from 1970 to be sent in 64 bits.
+    """
+    time_ns = utc_ns(text)
+    if abs(time_ns) > _FARTHEST_NS:
+        raise ValueError(f"time: expected one in the years 1701 to 2239, got {text!r}")
+    return time_ns
 
 
 def utc_ns(text: str) -> int:

@@ -87,6 +87,8 @@ def set_up_logging(command: str, form: LogForm, *, verbose: bool = False) -> Non
         Also log debug messages.
     """
     level = logging.DEBUG if verbose else logging.INFO
+    if not verbose:
+        logging.getLogger("alembic").setLevel(logging.WARNING)  # a dozen lines about each new database
     if form is LogForm.TEXT:
         logging.basicConfig(level=level, format=TEXT_FORMAT, stream=sys.stderr)
         return

@@ -66,12 +66,12 @@ class ServiceManager:
 
     @property
     def is_there(self) -> bool:
-        """Whether a service manager has started this process."""
+        """True if a service manager has started this process."""
         return self._address is not None
 
     @property
     def watches(self) -> bool:
-        """Whether it kills this process if no sign of life comes."""
+        """True if it kills this process unless signs of life come."""
         return self.is_there and self._silence_ns is not None
 
     def turn(self, describe: Callable[[], str]) -> None:
@@ -121,7 +121,7 @@ class ServiceManager:
             self._send("STOPPING=1", "STATUS=stopping")
 
     def _in_words(self, describe: Callable[[], str]) -> str:
-        """Return the state in one line, or the one before if it cannot be told: a sign of life needs no words."""
+        """Return the state in one line, or the former one if describing fails: a sign of life needs no words."""
         try:
             return " ".join(describe().split())[:MAX_STATUS]
         except Exception:  # noqa: BLE001 - whatever fails there, the process is alive

@@ -24,17 +24,18 @@ URL = "http://127.0.0.1:9"
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ("levels --device a --sample-rate 1e9", "expected a sampling rate from 1 to 1,000,000 Hz, got '1e9'"),
-        ("levels --device a --sample-rate nan", "expected a sampling rate from 1 to 1,000,000 Hz, got 'nan'"),
-        ("init s.yaml --rate 1e300", "expected a sampling rate from 1 to 1,000,000 Hz, got '1e300'"),
+        ("levels --device a --sample-rate 1e9", "expected a sampling rate from 100 to 1,000,000 Hz, got '1e9'"),
+        ("levels --device a --sample-rate nan", "expected a sampling rate from 100 to 1,000,000 Hz, got 'nan'"),
+        ("init s.yaml --rate 1e300", "expected a sampling rate from 100 to 1,000,000 Hz, got '1e300'"),
         ("init s.yaml --arrays 65", "expected 1 to 64 arrays, got 65"),
         (f"init s.yaml --arrays {'9' * 5000}", f"expected a whole number >= 1, got '{'9' * 40}'…"),
-        ("simulate --site s.yaml --out d --sample-rate 1e12", "expected a sampling rate from 1 to 1,000,000 Hz"),
+        ("simulate --site s.yaml --out d --sample-rate 1e12", "expected a sampling rate from 100 to 1,000,000 Hz"),
         ("simulate --site s.yaml --out d --seed -1", "expected a seed from 0 to 9223372036854775807, got '-1'"),
         ("simulate --site s.yaml --out d --count ²", "expected a whole number >= 1, got '²'"),
         ("simulate --site s.yaml --out d --count 1000000001", "expected a whole number >= 1, got '1000000001'"),
         ("events --min-confidence nan", "expected a number from 0 to 1, got 'nan'"),
         ("events --min-confidence 1.5", "expected a number from 0 to 1, got '1.5'"),
+        ("capture --site s.yaml --node n --start-at 0001-01-01T00:00:00Z", "expected one in the years 1701 to 2239"),
         ("events --track 1.5", "expected a whole number >= 0, got '1.5'"),
         ("doctor --url http://[", "--url: expected an address such as http://127.0.0.1:8000, got 'http://['"),
         ("calibrate verify --at 1,1,1 --url http://x:99999", "--url: expected an address such as"),
@@ -64,9 +65,7 @@ def test_rate_too_low_for_the_own_sounds_is_refused(run: Run, tmp_path: Path) ->
     assert not out.exists()
 
 
-@pytest.mark.parametrize(
-    ("command", "options"), [("simulate", ("--count", 1, "--rt60", 0)), ("plan", ("--rt60", 0))]
-)
+@pytest.mark.parametrize(("command", "options"), [("simulate", ("--count", 1, "--rt60", 0)), ("plan", ("--rt60", 0))])
 def test_folder_that_is_a_file_is_refused(run: Run, tmp_path: Path, command: str, options: tuple[object, ...]) -> None:
     site = write_site(tmp_path)
     done = run(command, "--site", site, "--out", site, *options)
@@ -115,7 +114,9 @@ HEARD = {"number": 1, "id": "lab-1", "time_utc": "2026-01-31T12:00:00Z", "positi
 SOUNDS = {"v": 1, "now_utc": "2026-01-31T12:00:00Z", "last": 1, "sounds": [HEARD]}
 
 VALUES = st.one_of(
-    st.sampled_from([None, True, "", "x", [], {}, [[]], -1, 0.5, 10**400]), st.floats(allow_nan=True), st.text(max_size=3)
+    st.sampled_from([None, True, "", "x", [], {}, [[]], -1, 0.5, 10**400]),
+    st.floats(allow_nan=True),
+    st.text(max_size=3),
 )
 
 

@@ -112,7 +112,7 @@ def test_answers_of_another_calibration_are_refused(
     before = out.read_bytes()
     done = run(*command, write_site(tmp_path, {**server, **changes}), *options)
     assert done.code == 2
-    assert "has answers of another calibration, --joint, site file or release" in done.err
+    assert "has answers of another calibration, --joint, site file, server or release" in done.err
     assert out.read_bytes() == before
 
 
@@ -130,5 +130,5 @@ def test_what_cannot_be_located_again_is_told(run: Run, tmp_path: Path) -> None:
     assert without.code == 2
     assert "expected a folder of clips, as the site file has no server.clips; name it" in without.err
     missing = run("relocate", tmp_path / "nowhere", "--site", site)
-    assert missing.code == 1
+    assert missing.code == 2
     assert "expected a folder of clips: No such file or directory; name it" in missing.err

@@ -23,7 +23,7 @@ from livessl.capture.spool import Spool
 from livessl.clock import utc_ns
 from livessl.core.locate.estimator import Localization, PowerMaps, Sound
 from livessl.core.types import FRAME_NS, BackfillRequest, Evidence, Frame, Mark, Message
-from livessl.server.app import assemble
+from livessl.server.assembly import Outlets, assemble
 from livessl.server.fanout import Fanout
 from livessl.server.history.backlog import Backlog
 from livessl.server.ingest import Ingest
@@ -322,9 +322,8 @@ class World:
         fusion = self.site.fusion.model_copy(update={"method": "world:Fingerprint"})
         site = self.site.model_copy(update={"fusion": fusion})
         self.post = Post(site, self.clock)
-        self.server = assemble(
-            site, self.clock, self.store, Sinks(()), Fanout(), self.published.append, receiver=self.post
-        )
+        outlets = Outlets(self.store, Sinks(()), Fanout(), self.published.append)
+        self.server = assemble(site, self.clock, outlets, receiver=self.post)
 
     def kill_server(self) -> None:
         self.server = None

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
-from collections.abc import Iterator
-from contextlib import suppress
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -181,8 +181,9 @@ def test_a_server_without_tls_gets_no_password() -> None:
     assert b"".join(received) == b""
 
 
-def test_a_connection_that_died_silently_is_left(tmp_path: Path) -> None:
+def test_a_connection_that_died_silently_is_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The library closes it after unanswered pings, but does not report that it is lost if TLS cannot be ended."""
+    attempts: list[Dead] = []
 
     class Dead:
         is_closed = True
@@ -190,13 +191,24 @@ def test_a_connection_that_died_silently_is_left(tmp_path: Path) -> None:
         def jetstream(self) -> None:
             return
 
+        async def publish(self, *_: object) -> None:
+            return
+
+    @asynccontextmanager
+    async def connects(*_: object) -> AsyncIterator[Dead]:
+        attempts.append(Dead())
+        yield attempts[-1]
+
+    monkeypatch.setattr("livessl.server.forwarding.link.connected", connects)
     desk = SiteDesk(hub_site(tmp_path, "lab", ["nats://127.0.0.1:1"]))
-    desk.link.take_alerts([{"kind": "alert", "key": f"a{n}", "raised_utc": "2026-01-01T00:00:00Z"} for n in range(2)])
-    desk.link.take_alerts([])
+    alerts = [{"kind": "alert", "key": f"a{n}", "raised_utc": "2026-01-01T00:00:00Z"} for n in range(2)]
+    desk.link.messages.take_alerts(alerts)
+    desk.link.messages.take_alerts([])
     assert [each.kind for each in desk.outbox.unsent(10)] == ["alert", "alert"]
-    dead: Any = Dead()
-    asyncio.run(asyncio.wait_for(desk.link._send_all(dead, asyncio.Event()), 60))
-    desk.store.close()
+    desk.start()
+    wait_until(lambda: len(attempts) > 2, "further connections")
+    desk.close()
+    assert desk.link.failure is None
 
 
 @given(first=st.integers(1, 2**59))

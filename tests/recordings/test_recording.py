@@ -41,11 +41,23 @@ def recording(seconds: float = 1.0, rate_hz: float = RATE_HZ, channels: int = 4,
 
 
 @pytest.mark.parametrize("rate_hz", [1, 24, 26])
-def test_file_with_a_rate_of_a_few_hertz_is_read_in_blocks(tmp_path: Path, rate_hz: int) -> None:
+def test_samples_at_a_few_hertz_are_read_in_blocks(rate_hz: int) -> None:
     samples = hiss(0.01)
-    path = write_wav(tmp_path / "slow.wav", samples, rate_hz)
-    for read in (FileRecording(path), MemoryRecording("slow", float(rate_hz), samples)):
-        assert_array_equal(joined(read.blocks(START_NS)), samples)
+    assert_array_equal(joined(MemoryRecording("slow", float(rate_hz), samples).blocks(START_NS)), samples)
+
+
+@pytest.mark.parametrize("rate_hz", [1, 99, 1_000_001, 2**31 - 1])
+def test_file_with_an_absurd_rate_is_refused(tmp_path: Path, rate_hz: int) -> None:
+    path = write_wav(tmp_path / "odd.wav", hiss(0.01), rate_hz)
+    with pytest.raises(DeviceError, match=r"expected a sampling rate from 100 to 1,000,000 Hz, got .*; export it"):
+        FileRecording(path)
+
+
+@pytest.mark.parametrize("rate_hz", [100, 1_000_000])
+def test_file_with_the_lowest_or_highest_rate_is_read(tmp_path: Path, rate_hz: int) -> None:
+    samples = hiss(0.01)
+    path = write_wav(tmp_path / "odd.wav", samples, rate_hz)
+    assert_array_equal(joined(FileRecording(path).blocks(START_NS)), samples)
 
 
 @pytest.mark.parametrize(

@@ -89,6 +89,8 @@ def test_folder_without_session_is_refused(tmp_path: Path) -> None:
         ("version: 2\npieces: [{array: n, file: n.wav, start_utc: '2026-01-01T00:00:00Z'}]\n", "version 1, got 2"),
         ("version: 1\npieces: [{array: n, file: n.wav}]\n", "pieces.0.start_utc: missing; add it"),
         ("version: 1\npieces: [{array: n, file: n.wav, start_utc: yesterday}]\n", "expected RFC 3339 .*'yesterday'"),
+        ("version: 1\npieces: [{array: n, file: n.wav, start_utc: '1700-12-31T00:00:00Z'}]\n", "years 1701 to 2239"),
+        ("version: 1\npieces: [{array: n, file: n.wav, start_utc: '9999-12-31T23:59:59-01:00'}]\n", "years 1701"),
         ("version: 1\npieces: [{array: n, file: n.wav, start_utc: '2026-01-01T00:00:00Z', x: 1}]\n", "pieces.0.x"),
     ],
 )

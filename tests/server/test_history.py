@@ -16,7 +16,7 @@ import pytest
 from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
 from alembic.script import ScriptDirectory
-from sqlalchemy import text
+from sqlalchemy import Connection, text
 
 from livessl.errors import ConfigError
 from livessl.server.api.encode import JsonObject
@@ -105,7 +105,7 @@ def test_migration_that_fails_leaves_the_older_file_as_it_was(tmp_path: Path) ->
 
 def test_migrations_make_the_tables_that_the_code_names(opened: Callable[[], Store]) -> None:
     store = opened()
-    with store._database.reading() as connection:
+    with store.database.reading() as connection:
 
         def is_made_here(_thing: object, name: str | None, *_: object) -> bool:
             return name != "event_tags_search" or connection.dialect.name == "postgresql"
@@ -316,7 +316,7 @@ def check_long_search(place: Path | str | None, monkeypatch: pytest.MonkeyPatch)
     store = Store(place)
     with (
         pytest.raises(StoreError, match=r"a search was ended after 0.5 s; narrow the span"),
-        store._database.reading() as connection,
+        store.database.reading() as connection,
     ):
         connection.execute(text(FOREVER))
     store.add(event(1), 0)
@@ -328,12 +328,12 @@ def test_search_in_memory_limits_no_write_after_it(monkeypatch: pytest.MonkeyPat
     """Both have the same connection there, and a write is no search."""
     monkeypatch.setattr(database, "STATEMENT_S", 0.0)
     store = Store(None)
-    with pytest.raises(StoreError, match="a search was ended"), store._database.reading() as connection:
+    with pytest.raises(StoreError, match="a search was ended"), store.database.reading() as connection:
         connection.execute(
             text("WITH RECURSIVE n(k) AS (SELECT 1 UNION ALL SELECT k + 1 FROM n) SELECT count(*) FROM n")
         )
     many = "WITH RECURSIVE n(k) AS (SELECT 1 UNION ALL SELECT k + 1 FROM n WHERE k < 50000) SELECT count(*) FROM n"
-    with store._database.writing("count") as connection:
+    with store.database.writing("count") as connection:
         assert connection.execute(text(many)).scalar() == 50_000
     store.close()
 
@@ -342,7 +342,7 @@ def test_events_of_before_the_journal_are_found_by_their_exclusion(place: Path |
     """The database is of the revision before: no journal, and no tags of excluded events."""
     store = Store(place)
     store.add_all([(event(number) | {"excluded": number == 2}, number) for number in range(4)])
-    with store._database.writing("go back") as connection:
+    with store.database.writing("go back") as connection:
         for sql in (
             "DELETE FROM event_tags WHERE kind = 'flag'",
             "DROP TABLE journal",
@@ -363,7 +363,7 @@ def test_reader_does_not_wait_long_for_other_readers(place: Path | str, monkeypa
     store = Store(place)
     with ExitStack() as others:
         for _ in range(database.READERS):
-            others.enter_context(store._database.reading())
+            others.enter_context(store.database.reading())
         with pytest.raises(StoreError, match=r"all 4 connections for reading are taken .*; wait for them, or narrow"):
             store.get("small-1")
     assert store.get("small-1") is None
@@ -372,7 +372,7 @@ def test_reader_does_not_wait_long_for_other_readers(place: Path | str, monkeypa
 
 def test_reader_sees_one_state(opened: Callable[[], Store]) -> None:
     store, count_all = opened(), text("SELECT count(*) FROM events")
-    with store._database.reading() as connection:
+    with store.database.reading() as connection:
         assert connection.execute(count_all).scalar() == 0
         store.add(event(1), 0)
         assert connection.execute(count_all).scalar() == 0
@@ -381,10 +381,10 @@ def test_reader_sees_one_state(opened: Callable[[], Store]) -> None:
 def test_what_waits_for_the_database_is_not_lost_by_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A count that fails holds up nothing."""
 
-    def fail(_: Store) -> None:
+    def fail(_: Connection) -> None:
         raise StoreError("cannot count")
 
-    monkeypatch.setattr(Store, "_count_all", fail)
+    monkeypatch.setattr("livessl.server.history.records.count_events", fail)
     store, done = Store(tmp_path / "events.db"), list[int]()
 
     def work() -> None:

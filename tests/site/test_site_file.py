@@ -392,6 +392,9 @@ def test_one_faulty_array_causes_no_other_faults() -> None:
         assert places == [f"{ARRAY}.position_m", "arrays.south"]
 
 
+BILLIONS = "a0: &a0 [x]\n" + "".join(f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]\n" for n in range(1, 10))
+
+
 @pytest.mark.parametrize(
     ("text", "where", "what"),
     [
@@ -407,6 +410,10 @@ def test_one_faulty_array_causes_no_other_faults() -> None:
         ("site: !!python/object:os.system {}\n", "site.yaml:1", "not valid YAML"),
         ("site: &a [*a]\n", "site.yaml", "an alias contains itself"),
         ("[" * 2000, "site.yaml", "not valid YAML"),
+        (BILLIONS, "site.yaml", "its aliases stand for more than 1,000,000 values; write them out"),
+        ("site: lab\nfusion: {min_arrays: 0x" + "f" * 4000 + "}\n", "site.yaml:2", "a number of at most 30 digits"),
+        ("site: lab\nfusion: {min_arrays: " + "9" * 5000 + "}\n", "site.yaml:2", "a number of at most 30 digits"),
+        ("site: \x01", "site.yaml", "not valid YAML: unacceptable character"),
     ],
     ids=lambda value: str(value)[:20],
 )
@@ -416,11 +423,31 @@ def test_text_that_is_not_a_site_is_refused(text: str, where: str, what: str) ->
     assert said.startswith(what) or what in said
 
 
+@pytest.mark.parametrize(
+    ("changes", "where", "what"),
+    [
+        ({"arrays.south.geometry": "a\0b"}, "arrays.south.geometry", "without NUL characters, got 'a\\x00b'"),
+        ({"calibration": "a\0b"}, "calibration", "without NUL characters"),
+        ({"zones_file": "a\0b"}, "zones_file", "without NUL characters"),
+        (
+            {"room.size_m": [999.0] * 3, "grid.spacing_m": 1e-4},
+            "grid.spacing_m",
+            "at most 1e+18 grid points, got 1e+21",
+        ),
+        ({"nodes.lab-pc.device": {"type": "scene", "seed": -1}}, "nodes.lab-pc.device.seed", "greater than or equal"),
+    ],
+)
+def test_hostile_value_is_one_fault(changes: dict[str, Any], where: str, what: str) -> None:
+    [(at, said)] = faults_of(text_of(changes))
+    assert at.partition(": ")[2] == where
+    assert what in said
+
+
 def test_unreadable_file_is_refused(tmp_path: Path) -> None:
     for path, reason in (
         (tmp_path / "missing.yaml", "No such file or directory"),
         (tmp_path, "Is a directory"),
-        (tmp_path / "latin.yaml", "can't decode byte"),
+        (tmp_path / "latin.yaml", "it is not UTF-8 text; save it as UTF-8"),
     ):
         (tmp_path / "latin.yaml").write_bytes("site: Tür".encode("latin-1"))
         with pytest.raises(ConfigError) as caught:

@@ -30,8 +30,8 @@ MOST_COUNT: Final = 1_000_000_000
 MOST_SEED: Final = 2**63 - 1
 """Largest random seed."""
 
-RATES_HZ: Final = (1.0, 1e6)
-"""Lowest and highest sampling rate, in hertz, that a site file may have."""
+RATES_HZ: Final = (100.0, 1e6)
+"""Lowest and highest sampling rate, in hertz, that recorders have."""
 
 
 def assignment(text: str) -> tuple[str, tuple[Path, ...]]:
@@ -92,9 +92,9 @@ def key(text: str) -> bytes:
 
 def time(text: str) -> int:
     """Return an RFC 3339 time as nanoseconds UTC."""
-    from livessl.clock import utc_ns
+    from livessl.clock import recordable_ns
 
-    return _read(text, utc_ns)
+    return _read(text, recordable_ns)
 
 
 def positive(text: str) -> int:

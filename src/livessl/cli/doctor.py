@@ -81,8 +81,7 @@ def _ask(url: str, token_file: Path | None) -> Examination:
     answer = ask_for(Findings, url, "findings", token_file)
     findings = tuple(Finding(**one.model_dump(exclude={"kind"})) for one in answer.findings)
     blind_spots = tuple(
-        BlindSpot(one.fault, tuple(one.arrays), one.least, tuple(one.along))
-        for one in answer.blind_spots
+        BlindSpot(one.fault, tuple(one.arrays), one.least, tuple(one.along)) for one in answer.blind_spots
     )
     return Examination(findings, answer.sounds, blind_spots)
 

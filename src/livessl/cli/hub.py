@@ -10,6 +10,7 @@ from typing import Any
 from livessl.cli.exits import OK
 from livessl.cli.service import service_manager
 from livessl.clock import SystemClock
+from livessl.garbage import collect_seldom
 
 
 def add_arguments(parser: Any) -> None:
@@ -21,6 +22,7 @@ def add_arguments(parser: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
+    collect_seldom()
     service = service_manager()
     from livessl.federation.app import HubServer
     from livessl.federation.config import load_hub

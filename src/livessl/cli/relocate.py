@@ -1,4 +1,7 @@
-"""`livessl relocate`: stored events by another method or calibration, answer beside answer, on all cores."""
+"""`livessl relocate`: stored events by another method or calibration, answer beside answer, on all cores.
+
+The recordings are in a folder, or at a running server, which locates the events itself.
+"""
 
 from __future__ import annotations
 
@@ -7,18 +10,20 @@ import json
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from livessl.cli import argument, progress
 from livessl.cli.exits import FAILED, OK
-from livessl.cli.options import add_joint, add_json, add_method, add_site, import_from_here, read_site
+from livessl.cli.options import add_joint, add_json, add_method, import_from_here, read_site
 from livessl.cli.output import complain, xyz
+from livessl.cli.server_answers import add_server
 from livessl.errors import UseError
 
 if TYPE_CHECKING:
-    from livessl.server.clips.folder import ClipReader
+    from livessl.server.clips.reader import ClipReader
     from livessl.server.clips.relocate_many import Task
     from livessl.site.models import Site
 
@@ -31,7 +36,8 @@ def add_arguments(parser: Any) -> None:
     """Describe the command's arguments."""
     add = parser.add_argument
     add("clips", type=Path, nargs="?", help="folder of clips (default: that of server.clips in the site file)")
-    add_site(parser)
+    parser.add_argument("--site", type=Path, help="site file; not with --url")
+    add_server(parser, "it locates its own events, one at a time, and stores nothing; for operators")
     add_method(parser, "that by which each event was located")
     add_joint(parser)
     add(
@@ -39,7 +45,7 @@ def add_arguments(parser: Any) -> None:
         choices=("then", "now"),
         default="then",
         help="poses and speed of sound; then: as when each event was located, now: as in the site file with its "
-        "calibration (default: then)",
+        "calibration, or at the server (default: then)",
     )
     add("--since", type=argument.time, metavar="TIME", help="only events that began at TIME or later (RFC 3339)")
     add("--until", type=argument.time, metavar="TIME", help="only events that began at TIME or earlier (RFC 3339)")
@@ -49,39 +55,26 @@ def add_arguments(parser: Any) -> None:
         metavar="FILE",
         help="append the answers to FILE, one JSON object a line, and skip the events that FILE already answers",
     )
-    add("--jobs", type=argument.positive, default=len(os.sched_getaffinity(0)), help="processes (default: all cores)")
+    add("--jobs", type=argument.positive, help="processes (default: all cores)")
     add_json(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
-    from livessl.core.methods import is_import_path
-    from livessl.server.clips.folder import ClipReader, ClipsError
-    from livessl.server.clips.relocate_many import Task, relocate_many
-    from livessl.site.build.fusion import make_estimator
-
     import_from_here()
-    site = read_site(arguments)
-    if arguments.method is not None and is_import_path(arguments.method):
-        make_estimator(site, arguments.method)  # one error before all, instead of one for each event
-    folder = _folder(arguments.clips, site)
-    task, clips = Task(site, folder, arguments.method, arguments.set_up), ClipReader(folder)
-    try:
-        ids = clips.ids()
-    except ClipsError as error:
-        raise UseError(str(error)) from error
-    wanted = [name for name in ids if _is_in_span(clips, name, arguments)]
+    archive: Archive = _at_server(arguments) if arguments.url is not None else _in_folder(arguments)
+    wanted = archive.ids(arguments.since, arguments.until)
     if not wanted:
-        complain(f"{folder}: no event of that span has recordings", kind="note")
+        complain(f"{archive.place}: no event of that span has recordings", kind="note")
     distances_m: list[float] = []
     failed = 0
     with (
-        _answers(arguments.out, task, wanted) as (known, keep),
+        _answers(arguments.out, archive, wanted) as (known, keep),
         progress.counted("locating", "event") as bar,
     ):
         missing = [name for name in wanted if name not in known]
         bar(len(wanted) - len(missing), len(wanted))
-        for done, found in enumerate(relocate_many(task, missing, arguments.jobs), len(wanted) - len(missing) + 1):
+        for done, found in enumerate(archive.relocate(missing), len(wanted) - len(missing) + 1):
             keep(found)
             _print(found, as_json=arguments.json)
             failed += found["again"] is None
@@ -94,6 +87,107 @@ def run(arguments: argparse.Namespace) -> int:
     return FAILED if failed else OK
 
 
+class Archive(Protocol):
+    """Recordings of events, and what they are located again with."""
+
+    @property
+    def method(self) -> str | None:
+        """The method; None for that of each event."""
+        ...
+
+    @property
+    def set_up(self) -> str:
+        """`then` or `now`."""
+        ...
+
+    @property
+    def digest(self) -> str:
+        """Digest of everything but the recordings that decides the answers."""
+        ...
+
+    @property
+    def place(self) -> str:
+        """The folder or the address."""
+        ...
+
+    def ids(self, since_ns: int | None, until_ns: int | None) -> list[str]:
+        """Return the ids of the events of a span that have recordings, which may be unreadable."""
+        ...
+
+    def relocate(self, event_ids: Sequence[str]) -> Iterator[dict[str, Any]]:
+        """Yield the answers for some events as they come."""
+        ...
+
+
+def _at_server(arguments: argparse.Namespace) -> Archive:
+    from livessl.cli.relocate_at_server import ServerArchive
+
+    given = {
+        "folder": arguments.clips,
+        "--site": arguments.site,
+        "--jobs": arguments.jobs,
+        "--joint": arguments.joint,
+    }
+    if wrong := [name for name, value in given.items() if value]:
+        raise UseError(
+            f"relocate: expected no {' and no '.join(wrong)} with --url, because the server locates; take one away"
+        )
+    return ServerArchive(arguments.url, arguments.token_file, arguments.method, arguments.set_up)
+
+
+def _in_folder(arguments: argparse.Namespace) -> Archive:
+    from livessl.core.methods import is_import_path
+    from livessl.server.clips.relocate_many import Task
+    from livessl.site.build.fusion import make_estimator
+
+    if arguments.site is None:
+        raise UseError("relocate: expected --site FILE or --url ADDRESS, got neither; give one")
+    site = read_site(arguments)
+    if arguments.method is not None and is_import_path(arguments.method):
+        make_estimator(site, arguments.method)  # one error before all, instead of one for each event
+    jobs = len(os.sched_getaffinity(0)) if arguments.jobs is None else arguments.jobs
+    return _FolderArchive(Task(site, _folder(arguments.clips, site), arguments.method, arguments.set_up), jobs)
+
+
+@dataclass(frozen=True)
+class _FolderArchive:
+    """A folder of clips, located again on some cores."""
+
+    task: Task
+    jobs: int
+
+    @property
+    def method(self) -> str | None:
+        return self.task.method
+
+    @property
+    def set_up(self) -> str:
+        return self.task.set_up
+
+    @property
+    def digest(self) -> str:
+        return self.task.digest
+
+    @property
+    def place(self) -> str:
+        return str(self.task.folder)
+
+    def ids(self, since_ns: int | None, until_ns: int | None) -> list[str]:
+        from livessl.server.clips.reader import ClipReader, ClipsError
+
+        clips = ClipReader(self.task.folder)
+        try:
+            ids = clips.ids()
+        except ClipsError as error:
+            raise UseError(str(error)) from error
+        return [name for name in ids if _is_in_span(clips, name, since_ns, until_ns)]
+
+    def relocate(self, event_ids: Sequence[str]) -> Iterator[dict[str, Any]]:
+        from livessl.server.clips.relocate_many import relocate_many
+
+        return relocate_many(self.task, event_ids, self.jobs)
+
+
 def _folder(given: Path | None, site: Site) -> Path:
     if given is not None:
         return given
@@ -102,19 +196,23 @@ def _folder(given: Path | None, site: Site) -> Path:
     return site.file(site.server.clips.folder)
 
 
-def _is_in_span(folder: ClipReader, event_id: str, arguments: argparse.Namespace) -> bool:
-    about = folder.about(event_id)
-    if about is None:
-        return False
-    start_ns = about.get("start_ns")
-    if not isinstance(start_ns, int):  # damaged: it is reported as an event that cannot be located again
+def _is_in_span(folder: ClipReader, event_id: str, since_ns: int | None, until_ns: int | None) -> bool:
+    from livessl.server.clips.reader import UnreadableClipError
+
+    if since_ns is None and until_ns is None:
         return True
-    is_after = arguments.since is None or start_ns >= arguments.since
-    return is_after and (arguments.until is None or start_ns <= arguments.until)
+    try:
+        clip = folder.read(event_id)
+    except UnreadableClipError:  # it is reported as an event that cannot be located again
+        return True
+    if clip is None:
+        return False
+    is_after = since_ns is None or clip.start_ns >= since_ns
+    return is_after and (until_ns is None or clip.start_ns <= until_ns)
 
 
 @contextmanager
-def _answers(path: Path | None, task: Task, wanted: Sequence[str]) -> Iterator[tuple[set[str], Any]]:
+def _answers(path: Path | None, task: Archive, wanted: Sequence[str]) -> Iterator[tuple[set[str], Any]]:
     """Open the file of answers; yield the ids of the events that were located, and a function that appends an answer.
 
     What the file says of wanted events that could not be located is removed, because they are tried again.
@@ -141,7 +239,7 @@ def _answers(path: Path | None, task: Task, wanted: Sequence[str]) -> Iterator[t
         yield known, keep
 
 
-def _sorted_out(path: Path, task: Task, wanted: frozenset[str]) -> set[str]:
+def _sorted_out(path: Path, task: Archive, wanted: frozenset[str]) -> set[str]:
     """Remove what a file of answers says of wanted events that could not be located; return the ids of those that were.
 
     Raises
@@ -172,7 +270,7 @@ def is_begun(line: bytes) -> bool:
     return line[: len(BEGINNING)] == BEGINNING[: len(line)]
 
 
-def _held(path: Path, line: bytes, task: Task) -> tuple[str, bool]:
+def _held(path: Path, line: bytes, task: Archive) -> tuple[str, bool]:
     """Return the id of the event that a line of the file of answers is about, and whether it was located.
 
     Raises
@@ -190,8 +288,8 @@ def _held(path: Path, line: bytes, task: Task) -> tuple[str, bool]:
         raise UseError(f"--out: {path} has answers of --method {method} --set-up {set_up}; name another file")
     if digest != task.digest:
         raise UseError(
-            f"--out: {path} has answers of another calibration, --joint, site file or release, which do not belong "
-            "beside those of now; name another file"
+            f"--out: {path} has answers of another calibration, --joint, site file, server or release, which do not "
+            "belong beside those of now; name another file"
         )
     return str(event_id), is_located
 

@@ -21,6 +21,25 @@ ANSWER_S: Final = 10.0
 """Longest wait for a server's answer, seconds."""
 
 
+class RefusedError(RunError):
+    """A server has refused a request.
+
+    Parameters
+    ----------
+    text : str
+        What it said, with the address.
+    status : int
+        Status of its answer.
+    reason : str
+        Its own words; empty if it gave none.
+    """
+
+    def __init__(self, text: str, status: int, reason: str) -> None:
+        super().__init__(text)
+        self.status = status
+        self.reason = reason
+
+
 def add_server(parser: Any, text: str) -> None:
     """Add --url and --token-file."""
     parser.add_argument("--url", help=f"address of a running server, such as http://127.0.0.1:8000; {text}")
@@ -44,7 +63,9 @@ def read_token(token_file: Path) -> str:
     except UnicodeDecodeError as error:
         raise UseError(f"--token-file: expected a token in {token_file}, got bytes that are no text") from error
     if not (token and token.isascii() and token.isprintable()):
-        raise UseError(f"--token-file: expected the line that `livessl keys token` printed in {token_file}, got another")
+        raise UseError(
+            f"--token-file: expected the line that `livessl keys token` printed in {token_file}, got another"
+        )
     return token
 
 
@@ -81,15 +102,15 @@ def fetch(address: str, token_file: Path | None) -> bytes:
     ------
     UseError
         If the address or the token's file cannot be used.
+    RefusedError
+        If the server refuses; with its reason.
     RunError
-        If the server does not answer, or refuses; with the server's reason.
+        If it does not answer.
     """
     return _answer(address, token_file, None, ANSWER_S)
 
 
-def order(
-    model: type[M], url: str, path: str, token_file: Path | None, value: Any, wait_s: float = ANSWER_S
-) -> M:
+def order(model: type[M], url: str, path: str, token_file: Path | None, value: Any, wait_s: float = ANSWER_S) -> M:
     """Return a server's answer to `POST /api/v1/PATH` with a value as JSON.
 
     Parameters
@@ -137,18 +158,20 @@ def _answer(address: str, token_file: Path | None, body: bytes | None, wait_s: f
             answer: bytes = response.read()
             return answer
     except urllib.error.HTTPError as error:
-        said = redirection(error) or _reason(error)
+        reason = _reason(error)
+        said = redirection(error) or (reason and f": {reason}")
         cure = "; give --token-file" if error.code in (401, 403) and token_file is None else ""
-        raise RunError(f"{address}: the server answered {error.code} {error.reason}{said}{cure}") from error
+        text = f"{address}: the server answered {error.code} {error.reason}{said}{cure}"
+        raise RefusedError(text, error.code, reason) from error
     except (OSError, ValueError, HTTPException) as error:
         why = getattr(error, "reason", error)
         raise RunError(f"{address}: no answer from a server ({why}); check that it runs and its address") from error
 
 
 def _reason(error: urllib.error.HTTPError) -> str:
-    """Return the reason that a server gives for a refusal, as the rest of a sentence; empty if it gives none."""
+    """Return the reason that a server gives for a refusal; empty if it gives none."""
     try:
         detail = json.load(error)["detail"]
+        return detail if isinstance(detail, str) else "; ".join(str(fault["msg"]) for fault in detail)
     except (OSError, ValueError, KeyError, TypeError):
         return ""
-    return f": {detail}" if isinstance(detail, str) else ""

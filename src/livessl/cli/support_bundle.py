@@ -1,4 +1,4 @@
-"""`livessl support-bundle`: one file with what helps others to find a fault, without secrets and without sound."""
+"""`livessl support-bundle`: one file that shows others the state of a server; it has no secrets and no sound."""
 
 from __future__ import annotations
 
@@ -38,19 +38,19 @@ ANSWERS: Final = {
     "rules.json": "alerts/rules",
     "log.json": f"log?limit={LINES}",
 }
-"""Parts of the bundle that a running server gives, by their path under /api/v1."""
+"""Parts of the bundle that a running server answers: the name of each, and its path under /api/v1."""
 
 
 @dataclass
 class Bundle:
-    """Parts of a bundle by their names, and why others are missing."""
+    """The parts of a bundle by name, and the reason for each part that is missing."""
 
     secrets: frozenset[str] = frozenset()
     parts: dict[str, bytes] = field(default_factory=dict)
     missing: dict[str, str] = field(default_factory=dict)
 
     def add(self, name: str, make: Callable[[], str]) -> None:
-        """Add a part without its secrets, or note why it cannot be had."""
+        """Add a part without its secrets, or note why it could not be made."""
         from livessl.site.redact import scrubbed
 
         try:
@@ -101,7 +101,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _add_site(bundle: Bundle, path: Path) -> Any:
-    """Add the site file without secrets, and what `check` finds in it; return its data, None if it has none."""
+    """Add the site file without secrets, and what `check` finds in it; return its data, or None if it is not YAML."""
     import yaml
 
     from livessl.site.findings import read_yaml
@@ -130,9 +130,9 @@ def _checked(path: Path) -> str:
 
 
 def _versions() -> dict[str, Any]:
-    """Return what runs where."""
+    """Return the versions of livessl, Python and all packages, and what machine this is."""
     found = ((one.metadata["Name"], one.version) for one in distributions())
-    packages = {name: version for name, version in found if name}  # what is left of an uninstalled one has no name
+    packages = {name: version for name, version in found if name}  # leftovers of an uninstalled package have no name
     return {
         "livessl": __version__,
         "python": sys.version,
@@ -174,7 +174,7 @@ def _journal() -> str:
     Raises
     ------
     RunError
-        If this machine has no journal of them.
+        If this machine has no journal, or its journal has no lines of these units.
     """
     program = shutil.which("journalctl")
     if program is None:

@@ -19,6 +19,7 @@ from livessl.federation.config import Hub
 from livessl.federation.intake import Intake
 from livessl.federation.metrics import metrics_route
 from livessl.federation.routes import hub_routes
+from livessl.garbage import collect_as_usual
 from livessl.schema.answers import errors
 from livessl.server.api.app import STATIC
 from livessl.server.api.auth import Access, Gate
@@ -131,6 +132,7 @@ class HubServer:
 
     def run(self) -> None:
         """Serve until SIGINT, SIGTERM or `stop`; raise the error that has ended the intake, if one has."""
+        collect_as_usual()  # or each answer about many sites has it look through all that was loaded
         try:
             asyncio.run(self._serve())
         finally:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import lru_cache
 from typing import Final, NamedTuple
 
 from livessl.clock import utc_text
@@ -10,6 +11,10 @@ from livessl.server.api.encode import JsonObject
 
 AWAY_S: Final = 30.0
 """Silence, in seconds, after which a site counts as away; it reports on itself every 5 s."""
+
+_utc_text: Final = lru_cache(maxsize=10_000)(utc_text)
+"""`utc_text`, which takes a quarter of the time of an answer about a thousand sites. From one answer to the next, most
+of them have no newer event, and contacts are noted for many sites at once."""
 
 
 class Contact(NamedTuple):
@@ -49,9 +54,10 @@ class Contact(NamedTuple):
         return int(self.report.get("waiting", 0))
 
     @property
-    def states(self) -> dict[str, str]:
+    def states(self) -> Mapping[str, str]:
         """State of each array by name at the last report, which names all of them; empty before the first one."""
-        return dict(self.report.get("arrays", {}))
+        states: Mapping[str, str] = self.report.get("arrays", {})
+        return states
 
 
 def describe(contact: Contact, states: Mapping[str, str]) -> JsonObject:
@@ -66,14 +72,14 @@ def describe(contact: Contact, states: Mapping[str, str]) -> JsonObject:
     return {
         "site": contact.site,
         "status": _condition(contact, states),
-        "contact_utc": utc_text(contact.contact_ns),
+        "contact_utc": _utc_text(contact.contact_ns),
         "age_s": round(contact.age_s, 3),
         "version": contact.report.get("version"),
         "location_deg": contact.report.get("location_deg"),
         "arrays": states,
         "waiting": contact.waiting,
         "missing": contact.missing,
-        "newest_event_utc": utc_text(contact.newest_ns) if contact.newest_ns else None,
+        "newest_event_utc": _utc_text(contact.newest_ns) if contact.newest_ns else None,
     }
 
 

@@ -18,6 +18,9 @@ from livessl.recordings.sound_file import SoundFile
 BLOCK_S: Final = 0.02
 """Length of a recording's blocks in seconds: the default of an audio interface, `device.block_s`."""
 
+RATES_HZ: Final = (100.0, 1e6)
+"""Lowest and highest sampling rate of a file, in hertz: no recorder has others, and a damaged header has any."""
+
 _SCAN_SAMPLES: Final = 1 << 18
 """Samples of each channel that are checked at a time, so that a long file does not fill the memory."""
 
@@ -67,7 +70,8 @@ class FileRecording:
     Raises
     ------
     DeviceError
-        If the file cannot be read, is empty, is all zero, or holds NaN or samples beyond `MAX_SAMPLE`.
+        If the file cannot be read, is empty, is all zero, holds NaN or samples beyond `MAX_SAMPLE`, or has a sampling
+        rate outside `RATES_HZ`.
     """
 
     def __init__(self, path: Path) -> None:
@@ -78,6 +82,12 @@ class FileRecording:
             self.channels = file.channels
             self.frames = file.frames
             self.note = file.note
+            low, high = RATES_HZ
+            if not low <= self.sample_rate_hz <= high:
+                raise DeviceError(
+                    f"{path}: expected a sampling rate from {low:g} to {high:,.0f} Hz, got {self.sample_rate_hz:g} Hz; "
+                    "export it again, or correct its header"
+                )
             self._check(file)
 
     @property
@@ -314,7 +324,7 @@ class StackedRecording:
 
 
 def _block_length(rate_hz: float) -> int:
-    """Return the number of samples of a block; at a rate of a few hertz a block has one and lasts longer."""
+    """Return the number of samples of a block; at a few hertz, which samples in memory may have, a block has one."""
     return max(1, round(BLOCK_S * rate_hz))
 
 

@@ -11,7 +11,7 @@ from typing import Any, Final
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
-from livessl.clock import utc_ns, utc_text
+from livessl.clock import recordable_ns, utc_ns, utc_text
 from livessl.errors import ConfigError, Fault
 from livessl.site.findings import dotted, read_yaml, validation_findings
 from livessl.site.load import load_site
@@ -35,7 +35,7 @@ class Piece(BaseModel):
     @field_validator("start_utc")
     @classmethod
     def _instant(cls, text: str) -> str:
-        utc_ns(text)
+        recordable_ns(text)
         return text
 
     @property

@@ -194,14 +194,14 @@ class BlindSpot(Model):
             "these sounds cannot show whether 'north' or 'south' is moved by less than 0.8 m along (0.96, 0.27, 0.00)"
         ],
     )
+    cure: str = Field(
+        description="What would show it.", examples=["clap at places that you know, and run livessl calibrate verify"]
+    )
 
     @property
     def least(self) -> float:
         """`least_m` of a shift, and `least_deg` of a turn; NaN in an answer that has neither."""
         return next((least for least in (self.least_m, self.least_deg) if least is not None), math.nan)
-    cure: str = Field(
-        description="What would show it.", examples=["clap at places that you know, and run livessl calibrate verify"]
-    )
 
 
 class Findings(Versioned):
@@ -212,7 +212,7 @@ class Findings(Versioned):
     blind_spots: list[BlindSpot] = Field(
         default=[],  # of a server that is older than the field
         description="What these sounds cannot show about poses. Empty with fewer than three sounds of two arrays, and "
-        "while a finding is about poses: then sizes would not hold."
+        "while a finding is about poses: then sizes would not hold.",
     )
 
 

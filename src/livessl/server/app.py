@@ -1,4 +1,4 @@
-"""The fusion server as one process: `assemble` is the list of what runs, `Server` runs it until it is stopped."""
+"""The fusion server as one process: `Server` starts the parts that `assembly` lists, and stops them in order."""
 
 from __future__ import annotations
 
@@ -7,60 +7,29 @@ import logging
 import sys
 from collections.abc import Callable
 from contextlib import ExitStack
-from functools import partial
 from typing import Final
 
 from livessl.clock import Clock
 from livessl.errors import ConfigError
 from livessl.garbage import collect_as_usual
-from livessl.server.alerts.evidence import Evidence
-from livessl.server.alerts.in_force import Surroundings
 from livessl.server.alerts.restoration import restore_alerts
-from livessl.server.alerts.service import Alerts, Conditions
 from livessl.server.api.app import create_app
 from livessl.server.api.auth import Access
 from livessl.server.api.encode import JsonObject
-from livessl.server.array_states import ArrayStates
-from livessl.server.clips.listeners import Listeners
-from livessl.server.clips.relocate import Relocator
-from livessl.server.clips.service import Clips
+from livessl.server.assembly import Outlets, assemble
 from livessl.server.compiling import KernelLoader
-from livessl.server.engine import Engine
-from livessl.server.event_log import EventLog
 from livessl.server.event_retention import delete_old_events
-from livessl.server.event_traces import EventTraces
 from livessl.server.fanout import Fanout
-from livessl.server.forwarding.link import HubLink
 from livessl.server.http import certificate_of, listen, url_of, uvicorn_server
-from livessl.server.journal import Journal, also
-from livessl.server.latency import Latency
-from livessl.server.maps import Maps
-from livessl.server.overload import Overload
-from livessl.server.parts import Parts
-from livessl.server.pose_refiner import PoseRefiner
-from livessl.server.proposals import Proposals
-from livessl.server.publisher import Publisher
-from livessl.server.receiver import Inbox, Receiver
-from livessl.server.recent_log import RecentLog
-from livessl.server.reload import Reloader
-from livessl.server.set_up_in_force import SetUpInForce
-from livessl.server.set_up_watch import SetUpWatch
+from livessl.server.receiver import Inbox
 from livessl.server.sign_of_life import SignOfLife
 from livessl.server.signed_links import SignedLinks
 from livessl.server.sinks import Sinks
-from livessl.server.site_time import SiteTime
 from livessl.server.store import Store
-from livessl.server.tracks import Tracks
-from livessl.server.trails import Trails
-from livessl.server.zones.book import ZoneBook
-from livessl.server.zones.presence import Presence
-from livessl.server.zones.zone_map import ZoneMap
 from livessl.service_manager import ServiceManager
 from livessl.site.alert_checks import link_secret_file
 from livessl.site.checks import unprotected_addresses
-from livessl.site.floor_plan import read_floor_plan
 from livessl.site.models import Site
-from livessl.traces import traces_in_use
 
 SWITCH_S: Final = 0.0005
 """Longest time, in seconds, that a thread holds the GIL while another one waits for it. The fusion thread
@@ -70,147 +39,6 @@ WATCH_S: Final = 0.2
 """Interval, in seconds, at which the threads are checked for a failure."""
 
 _log = logging.getLogger(__name__)
-
-
-def assemble(
-    site: Site,
-    clock: Clock,
-    store: Store,
-    sinks: Sinks,
-    fanout: Fanout,
-    publish: Callable[[JsonObject], None],
-    receiver: Inbox | None = None,
-    on_event: Callable[[JsonObject], None] | None = None,
-    url: str = "",
-    read_site: Callable[[], Site] | None = None,
-    links: SignedLinks | None = None,
-) -> Parts:
-    """Make everything that runs in a server; nothing runs yet.
-
-    Parameters
-    ----------
-    publish : callable
-        Gets every message for subscribers; called on the fusion thread.
-    receiver : Inbox or None
-        Stands in for the nodes' socket.
-    on_event : callable or None
-        Gets every event after the sinks and before `publish`; called on the fusion thread.
-    url : str
-        Address of the server, for the links in alerts.
-    read_site : callable or None
-        Reads the site file again; None for a server without one.
-    links : SignedLinks or None
-        Signs links for people without a token; None if nobody needs one.
-
-    Raises
-    ------
-    BindError, ConfigError, ClipsError
-        See `Receiver`, `Alerts` and `Clips`.
-    """
-
-    def publish_to_all(message: JsonObject) -> None:
-        if hub_link is not None and not site_time.is_replay:
-            hub_link.take(message)
-        publish(message)
-
-    def publish_event(event: JsonObject) -> None:
-        sinks.take(event)
-        if on_event is not None:
-            on_event(event)
-        publish(event)
-
-    with ExitStack() as undo:
-        if receiver is None:
-            receiver = Receiver(site, clock)
-            undo.callback(receiver.stop)
-        site_time = SiteTime(clock)
-        journal = Journal(store, clock)
-        journal.site(site)
-        hub_link = None
-        if store.outbox is not None:
-            hub_link = HubLink(site, clock, store.outbox, store.backlog, lambda: array_states.describe(levels=False))
-        zone_book = ZoneBook(site, publish)
-
-        def zones() -> ZoneMap:
-            return zone_book.current
-
-        latency, maps = Latency(clock, receiver.arrivals), Maps(clock)
-        overload = Overload(clock)
-        # milliseconds since the epoch: a restarted server gives no sound the number of an earlier one
-        set_up_watch = SetUpWatch(site, overload, first_sound=clock.now_ns() // 1_000_000)
-        found = traces_in_use()
-        traces = None if found is None else EventTraces(found)
-
-        def keep_alert(alert: JsonObject) -> None:
-            journal.alert(alert, partial(alerts.note_in_journal, alert) if store.is_durable else None)
-
-        publish_arrays, publish_alert = also(journal.arrays, publish_to_all), also(keep_alert, publish_to_all)
-        array_states = ArrayStates(
-            site, clock, store, site_time, receiver.ingest, overload, set_up_watch, publish_arrays
-        )
-        set_up = SetUpInForce(site, clock, publish)
-        kept, listeners = site.server.clips, Listeners()
-        clips = None if kept is None else Clips(site, kept, clock, site_time, overload)
-        relocator = None if clips is None else Relocator(clips.folder, clock, lambda: set_up.site, overload)
-        evidence = Evidence(lambda: set_up.site, zones, clips)
-        around = Surroundings(clock, store, zones, url, evidence, traces, links)
-        alerts = Alerts(site, around, Conditions(array_states, set_up_watch, site_time), publish_alert)
-        undo.callback(alerts.stop)
-
-        def publish_change(change: JsonObject, time_ns: int) -> None:
-            if not site_time.is_replay:
-                alerts.take_change(change, time_ns)
-            publish(change)
-
-        presence = Presence(zones, publish_change)
-        tracks = Tracks(presence, Trails(journal, lambda: site_time.is_replay))
-        event_log = EventLog(site.site, clock, store, latency, publish_event, alerts, traces)
-        publisher = Publisher(
-            publish_to_all, receiver.request, site_time, event_log, tracks, maps, latency, overload, set_up_watch, clips
-        )
-        sound = (listeners,) if clips is None else (listeners, clips)
-        engine = Engine(
-            site, clock, receiver, site_time, array_states, event_log, maps, publisher, overload, zones, sound, traces
-        )
-        proposals = Proposals(set_up, set_up_watch.heard, clock)
-        refiner = PoseRefiner(proposals, set_up, set_up_watch.heard, overload)
-        for follower in (engine.prepare, set_up_watch.prepare, *(() if clips is None else (clips.prepare,))):
-            set_up.follow(follower)
-        floor_plan = read_floor_plan(site)
-        reloader = Reloader(site, read_site, zone_book, alerts, journal.site, set_up)
-        undo.pop_all()
-    return Parts(
-        site=site,
-        clock=clock,
-        receiver=receiver,
-        refusals=receiver.refusals,
-        engine=engine,
-        site_time=site_time,
-        array_states=array_states,
-        event_log=event_log,
-        alerts=alerts,
-        clips=clips,
-        relocator=relocator,
-        listeners=listeners,
-        tracks=tracks,
-        maps=maps,
-        latency=latency,
-        overload=overload,
-        set_up=set_up,
-        proposals=proposals,
-        refiner=refiner,
-        set_up_watch=set_up_watch,
-        store=store,
-        sinks=sinks,
-        fanout=fanout,
-        zone_book=zone_book,
-        journal=journal,
-        presence=presence,
-        floor_plan=floor_plan,
-        hub_link=hub_link,
-        reloader=reloader,
-        recent_log=RecentLog(),
-    )
 
 
 class Server:
@@ -276,9 +104,8 @@ class Server:
             url = url_of(self._listener, tls=certificate is not None)
             # milliseconds since the epoch: fewer than one message per millisecond is published, so none is used again
             fanout = Fanout(clock.now_ns() // 1_000_000)
-            self.parts = assemble(
-                site, clock, store, sinks, fanout, self._publish, receiver, on_event, url, read, links
-            )
+            outlets = Outlets(store, sinks, fanout, self.publish, on_event)
+            self.parts = assemble(site, clock, outlets, receiver, url, read, links)
             undo.pop_all()
         self.uvicorn = uvicorn_server(create_app(self.parts, self._access), certificate)
         """The HTTP server."""
@@ -323,6 +150,17 @@ class Server:
         """End `run`; from any thread."""
         self.uvicorn.should_exit = True
 
+    def publish(self, message: JsonObject) -> None:
+        """Hand a message to subscribers; from any thread."""
+        published_ns = self._clock.monotonic_ns() if message.get("latency_stages_s") else None
+        loop = self.loop
+        if loop is None:
+            return
+        try:
+            loop.call_soon_threadsafe(self.parts.fanout.publish, message, published_ns)
+        except RuntimeError:  # the loop has just closed, and no subscriber is left
+            _log.debug("a message was published after the event loop had closed")
+
     def wait_idle(self) -> None:
         """Return when the running replay has ended and its last event is published."""
         self.parts.engine.wait_idle()
@@ -362,7 +200,7 @@ class Server:
                 raise error
 
     def _stop_on_error(self, task: asyncio.Task[None]) -> None:
-        """Stop if a task has failed: what it did would be missed, and nobody would know."""
+        """Stop if a task has failed: a server without it would look alive and do a part of its work only."""
         if not task.cancelled() and task.exception() is not None:
             self.stop()
 
@@ -379,17 +217,6 @@ class Server:
         """End the request that waits for an event to be located again; a thread that waited on would hold the exit."""
         if self.parts.relocator is not None:
             self.parts.relocator.stop()
-
-    def _publish(self, message: JsonObject) -> None:
-        """Hand a message to subscribers; on the fusion thread."""
-        published_ns = self._clock.monotonic_ns() if message.get("latency_stages_s") else None
-        loop = self.loop
-        if loop is None:
-            return
-        try:
-            loop.call_soon_threadsafe(self.parts.fanout.publish, message, published_ns)
-        except RuntimeError:  # the loop has just closed, and no subscriber is left
-            _log.debug("a message was published after the event loop had closed")
 
 
 def _usable(site: Site, method: str | None) -> Site:

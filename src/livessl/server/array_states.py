@@ -213,11 +213,11 @@ class ArrayStates:
         name = status.name
         return {
             **status.counters,
-            "duplicates": self._ingest.duplicates[name] + fusion.duplicates.get(name, 0),
+            "duplicates": self._ingest.duplicates[name] + fusion.input.duplicates.get(name, 0),
             "sequence_gaps": self._ingest.sequence_gaps[name],
-            "backfilled": fusion.backlog_frames.get(name, 0),
+            "backfilled": fusion.input.backlog_frames.get(name, 0),
             "asked": fusion.asked.get(name, 0),
             "helped": fusion.helped.get(name, 0),
-            "too_late": fusion.too_late.get(name, 0),
+            "too_late": fusion.input.too_late.get(name, 0),
             "shed": self._ingest.shed[name],
         }

@@ -107,13 +107,13 @@ class Engine:
 
     @property
     def has_turned(self) -> bool:
-        """Whether the thread has taken its first turn: what computes is loaded by then."""
+        """True once the thread has taken its first turn: the modules that compute are loaded by then."""
         return self.turns > 0
 
     @property
     def updates_left_out(self) -> int:
         """Windows of this run that were not localized because newer ones were due."""
-        return self._run.fusion.updates_left_out
+        return self._run.fusion.updates.left_out
 
     def start(self, prepare: Callable[[], None]) -> None:
         """Start the thread, which calls `prepare` before its first turn."""
@@ -180,7 +180,7 @@ class Engine:
         run, live = self._run, not self._site_time.is_replay
         relief = self._overload.note(self._receiver.delay_s, items, waited_ns, sheds=live)
         run.fusion.relieve(relief)
-        self._overload.updates_shed = self._updates_shed + run.fusion.updates_shed
+        self._overload.updates_shed = self._updates_shed + run.fusion.updates.shed
         self._receiver.ingest.keep_samples_of(run.fusion.located if relief.arrays is not None else None)
 
     def _work(self) -> None:

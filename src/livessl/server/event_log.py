@@ -26,7 +26,7 @@ _log = logging.getLogger(__name__)
 
 
 class Watcher(Protocol):
-    """Sees the events of live runs, on the fusion thread, after the store."""
+    """Gets the events of live runs, on the fusion thread, after the store."""
 
     def take_early(self, event: JsonObject, time_ns: int) -> None:
         """Take in an event that may still be replaced, and its start in nanoseconds of site time."""
@@ -38,7 +38,7 @@ class Watcher(Protocol):
 
 
 class Answer(NamedTuple):
-    """The answer that an event gives, at its published precision; an event that repeats it is not published again."""
+    """Values of an event, rounded as they are published. A final event with the same values is not published again."""
 
     start_us: int
     duration_s: float
@@ -61,7 +61,7 @@ class Answer(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class EarlyEvent:
-    """An event that was published and stored before all of its sound was there; a final one may replace it.
+    """An event that was published and stored before all of its sound had arrived; a final one may replace it.
 
     Parameters
     ----------
@@ -111,11 +111,11 @@ class EventLog:
     clock : Clock
     store : Store
     latency : Latency
-        Measures how long events took.
+        Measures the latency of events.
     publish : callable
         Gets the message of every event.
     watcher : Watcher or None
-        Sees the events of live runs, those included that are not published again.
+        Gets all events of live runs, also those that are not published again.
     traces : EventTraces or None
         Adds spans of the events of live runs; None if nothing is traced.
     """
@@ -190,14 +190,14 @@ class EventLog:
         self._publish_event(message, event, stages)
 
     def add_final(self, results: FinalResults, messages: Messages, clocks: JsonObject) -> None:
-        """Store final events in place of the early ones, then publish those that are news.
+        """Store final events in place of the early ones, then publish those that are new or have changed.
 
         Parameters
         ----------
         results : FinalResults
         messages : Messages
         clocks : JsonObject
-            What is known of the arrays' clocks: without it, a frame index means another time to each array.
+            What is known of the arrays' clocks, to which the frame indices of their nodes refer.
         """
         if self._is_replay:
             self._add_replayed(results.events, messages)
@@ -220,7 +220,8 @@ class EventLog:
         replaced = [early.id for early, successor in successors if successor is not None]
         done = {event.id for event in results.events} | {early.id for early in before}
         self._early = [early for early in self._early if early.id not in done]
-        until, kept = results.until, orjson.dumps(clocks)  # as bytes: thousands may wait for a database
+        # bytes need less memory than the values, and thousands may wait for a database
+        until, kept = results.until, orjson.dumps(clocks)
         bodies = [(orjson.dumps(message), time_ns) for message, time_ns in rows]
 
         def store() -> None:
@@ -249,7 +250,7 @@ class EventLog:
             self._publish_event(message, event, None)
 
     def _add(self, message: JsonObject, time_ns: int, *, early: bool = False) -> None:
-        """Have an event stored that is early, or of a replay."""
+        """Have an early event stored, or one of a replay."""
         body = orjson.dumps(message)
 
         def store() -> None:
@@ -271,5 +272,5 @@ class EventLog:
         self._traces.published(event, stages, began_ns, self._clock.now_ns(), first=first)
 
     def _stages(self, event: Event) -> Stages | None:
-        """Return where the time went that the event took; nothing of a recording's, which is long past."""
+        """Return the stages of an event's latency; None in a replay, whose sounds are long past."""
         return None if self._is_replay else self._latency.located(event)

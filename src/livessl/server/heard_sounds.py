@@ -1,4 +1,4 @@
-"""The last sounds with the delays that each array observed: what commands and pages calibrate with."""
+"""The last sounds, each with the delays that the arrays observed; commands and the dashboard calibrate with them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from livessl.core.commission.observe import observe
 from livessl.core.types import Event, Observation
 
 KEPT: Final = 64
-"""Number of sounds that are kept: more than a calibration needs, by claps (12) or by unknown sounds (20)."""
+"""Number of sounds that are kept. A calibration needs fewer: 12 claps, or 20 sounds at unknown places."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,7 +23,7 @@ class HeardSound:
     number : int
         Number of the sound; later sounds have higher ones.
     event : Event
-        Its final event, without what it was located from.
+        Its final event, without `received`.
     observations : tuple of Observation
     """
 
@@ -86,7 +86,7 @@ class HeardSounds:
         Raises
         ------
         LookupError
-            With the first number that is not kept.
+            If a sound is not kept any more; the error contains the first such number.
         """
         known = {sound.number: sound for sound in self.after(0)}
         missing = next((number for number in numbers if number not in known), None)

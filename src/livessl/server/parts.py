@@ -1,4 +1,4 @@
-"""The parts of a running server, by name: `app` makes them, the API reads them."""
+"""The parts of a running server, by name: `assembly` makes them, the API reads them."""
 
 from __future__ import annotations
 

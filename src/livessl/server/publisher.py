@@ -1,4 +1,4 @@
-"""Hands each result of the fusion to the part that publishes, keeps or draws it. `core.stream.fusion` sets the rate."""
+"""Hands each result of the fusion to the part that publishes, keeps or draws it."""
 
 from __future__ import annotations
 

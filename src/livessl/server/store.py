@@ -9,13 +9,13 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import orjson
-from sqlalchemy import func, select
+from sqlalchemy import select
 
 from livessl.server.forwarding import tables as forwarding
-from livessl.server.forwarding.outbox import Outbox, Outgoing
+from livessl.server.forwarding.outbox import Outbox
 from livessl.server.history import records
 from livessl.server.history.backlog import Backlog
 from livessl.server.history.database import CURE, Database, StoreError
@@ -31,8 +31,9 @@ from livessl.server.history.journal import (
 )
 from livessl.server.history.log import LogPage, LogPosition, log_page
 from livessl.server.history.query import Cursor, Page, Query, Row
-from livessl.server.history.search import page_statement
-from livessl.server.history.tables import disabled, events, progress
+from livessl.server.history.search import event_page
+from livessl.server.history.site_progress import Finalized, disabled_arrays, finalized, put_disabled, put_progress
+from livessl.server.history.tables import events
 from livessl.site.history_place import history_place
 from livessl.site.models import Site
 
@@ -57,21 +58,6 @@ PAUSE_S: Final = 0.01
 """Pause, in seconds, between two of these transactions, in which what waits is written."""
 
 _log = logging.getLogger(__name__)
-
-
-class Finalized(NamedTuple):
-    """Progress of the final pass.
-
-    Parameters
-    ----------
-    until : int or None
-        Frame index before which all events are final; None if there are none yet.
-    clocks : JsonObject or None
-        What was known of the arrays' clocks then.
-    """
-
-    until: int | None
-    clocks: JsonObject | None
 
 
 class Store:
@@ -199,12 +185,9 @@ class Store:
             if self._bounded:
                 change -= records.keep_newest(connection, MAX_EVENTS_IN_MEMORY)
             kept = records.end_early(connection, frame_index)
-            records.put_progress(connection, site, frame_index, clocks)
+            put_progress(connection, site, frame_index, clocks)
             if self.outbox is not None:
-                known = {event["id"] for event, _ in events}
-                final = [*events, *((event, time_ns) for event, time_ns in kept if event["id"] not in known)]
-                final.sort(key=lambda each: each[1])
-                self.outbox.put_with(connection, [Outgoing("event", time_ns, event) for event, time_ns in final])
+                self.outbox.put_final_with(connection, events, kept)
         self._counted(change)
         if self.outbox is not None:
             self.outbox.wake()
@@ -212,31 +195,24 @@ class Store:
     def finalized(self, site: str) -> Finalized:
         """Return how far the final pass of the site has come."""
         self.backlog.settle()
-        query = select(progress.c.frame_index, progress.c.clocks).where(progress.c.site == site)
         with self._database.reading() as connection:
-            row = connection.execute(query).one_or_none()
-        if row is None:
-            return Finalized(None, None)
-        return Finalized(int(row.frame_index), None if row.clocks is None else orjson.loads(row.clocks))
+            return finalized(connection, site)
 
     def disabled(self, site: str) -> frozenset[str]:
         """Return the names of the site's disabled arrays."""
         with self._database.reading() as connection:
-            found = connection.execute(select(disabled.c.array).where(disabled.c.site == site))
-            return frozenset(found.scalars())
+            return disabled_arrays(connection, site)
 
     def enable(self, site: str, array: str, enabled: bool) -> None:
         """Remember whether an array is enabled."""
         with self._database.writing(f"store the state of array {array!r}") as connection:
-            records.put_disabled(connection, site, array, is_disabled=not enabled)
+            put_disabled(connection, site, array, is_disabled=not enabled)
 
     def early_events(self) -> list[tuple[int, JsonObject]]:
         """Return the events that are still early, oldest first, each with its start in nanoseconds of site time."""
         self.backlog.settle()
-        query = select(events.c.time_ns, events.c.body).order_by(events.c.time_ns)
         with self._database.reading() as connection:
-            rows = connection.execute(query.where(events.c.id.in_(records.early_ids(connection)))).all()
-        return [(time_ns, orjson.loads(body)) for time_ns, body in rows]
+            return records.early_events(connection)
 
     def expire(self, before_ns: int, end: threading.Event | None = None) -> int:
         """Delete the events and entries of before a time, and overwrite them in an SQLite file.
@@ -273,13 +249,7 @@ class Store:
         """Return a page of events, newest first by their start, with the cursors of its neighbours."""
         self.backlog.settle()
         with self._database.reading() as connection:
-            found = connection.execute(page_statement(query, query.limit + 1)).all()
-        rows = [Row(*row) for row in found[: query.limit]]
-        has_more = len(found) > query.limit
-        if query.after is not None:
-            rows.reverse()
-            return Page(rows, rows[-1].cursor if rows else None, rows[0].cursor if rows else query.after)
-        return Page(rows, rows[-1].cursor if has_more else None, rows[0].cursor if rows else None)
+            return event_page(connection, query)
 
     def log(self, query: Query, after: LogPosition | None) -> LogPage:
         """Return the events that were stored after a position; see `log_page`."""
@@ -333,7 +303,7 @@ class Store:
 
     def _count_all(self) -> None:
         with self._database.reading() as connection:
-            count = int(connection.execute(select(func.count()).select_from(events)).scalar_one())
+            count = records.count_events(connection)
         with self._counting:
             self._count = count
 

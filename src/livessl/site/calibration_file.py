@@ -39,7 +39,7 @@ def found_name(site: Any, directory: Path) -> str | None:
     directory : Path
         Folder of the site file.
     """
-    if not isinstance(site, str) or "/" in site:
+    if not isinstance(site, str) or "/" in site or "\0" in site:
         return None
     name = default_name(site)
     try:

@@ -31,6 +31,9 @@ from livessl.site.zone_models import Zone
 COINCIDENT_M: Final = 1e-3
 """Distance in metres below which two microphones are taken for a slip in the file: capsules are larger than that."""
 
+MOST_GRID_POINTS: Final = 10**18
+"""Most points of the search grid, which are numbered in 64 bits."""
+
 SAMPLED_GRID_POINTS: Final = 500
 """Approximate number of grid points at which `wide_arrays` compares the grid with an array: enough for a median."""
 
@@ -56,6 +59,10 @@ def cross_faults(site: Site) -> Iterator[Finding]:
             f"got {site.fusion.min_arrays}",
         )
     yield from ((("grid", "bounds_m"), what) for what in _outside(site, site.grid.bounds_m))
+    size = search_grid(site).size
+    if size > MOST_GRID_POINTS:
+        what = f"expected at most {MOST_GRID_POINTS:.0e} grid points, got {size:.0e}; use a larger spacing"
+        yield ("grid", "spacing_m"), what
     for name, zone in site.zones.items():
         yield from zone_faults(site, name, zone)
     for name in site.drawn_zones:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 Coordinate = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, le=1e6, allow_inf_nan=False)]
@@ -13,7 +13,15 @@ Interval = tuple[Coordinate, Coordinate]
 Bounds = tuple[Interval, Interval, Interval]
 BandHz = tuple[Annotated[float, Field(ge=0)], Positive]
 
-FileName = Annotated[str, Field(min_length=1)]
+
+def without_nul(name: str) -> str:
+    """Return the path of a file; raise `ValueError` if no file can have it."""
+    if "\0" in name:
+        raise ValueError(f"expected the path of a file, without NUL characters, got {name!r}")
+    return name
+
+
+FileName = Annotated[str, Field(min_length=1), AfterValidator(without_nul)]
 """Path of a file or folder; `Site.file` resolves it from the site file's folder."""
 
 

@@ -30,6 +30,14 @@ _SENTENCES: Final = {
 }
 """Sentence for each type of pydantic error; other types keep pydantic's own."""
 
+MOST_NODES: Final = 1_000_000
+"""Most values of a YAML file once its aliases are replaced by what they stand for: a few lines can stand for billions."""
+
+MOST_DIGITS: Final = 30
+"""Most characters of a whole number; Python refuses to print numbers of thousands of digits."""
+
+_INT: Final = "tag:yaml.org,2002:int"
+
 Read = TypeVar("Read", bound=BaseModel)
 
 
@@ -58,7 +66,12 @@ def read_yaml(text: str) -> Any:
     yaml.YAMLError
         If it is not YAML, or holds an impossible value.
     """
-    return value_of(nodes_of(text))
+    root = nodes_of(text)
+    try:
+        require_sane(root)
+    except RecursionError as error:
+        raise yaml.YAMLError(str(error)) from error
+    return value_of(root)
 
 
 def nodes_of(text: str) -> yaml.Node | None:
@@ -73,6 +86,43 @@ def nodes_of(text: str) -> yaml.Node | None:
         return yaml.compose(text, Loader=yaml.SafeLoader)
     except (ValueError, RecursionError) as error:  # the library's parser leaks these
         raise yaml.YAMLError(f"{type(error).__name__}: {error}") from error
+
+
+def require_sane(root: yaml.Node | None) -> None:
+    """Check that the values of a YAML text can be handled, however they are written.
+
+    Raises
+    ------
+    RecursionError
+        If an alias contains itself.
+    yaml.YAMLError
+        If there are more than `MOST_NODES` values once aliases are replaced, or a number is too long.
+    """
+    if root is None:
+        return
+    if _size(root, {}) > MOST_NODES:
+        raise yaml.YAMLError(f"its aliases stand for more than {MOST_NODES:,} values; write them out, or fewer of them")
+
+
+def _size(node: yaml.Node, known: dict[int, int | None]) -> int:
+    """Return the number of values of a node; `known` has those of the nodes before, None for those around it."""
+    key = id(node)
+    if key in known:
+        size = known[key]
+        if size is None:
+            raise RecursionError("an alias contains itself")
+        return size
+    known[key] = None
+    parts: list[yaml.Node] = []
+    if isinstance(node, yaml.MappingNode):
+        parts = [part for pair in node.value for part in pair]
+    elif isinstance(node, yaml.SequenceNode):
+        parts = node.value
+    elif node.tag == _INT and len(node.value) > MOST_DIGITS:
+        what = f"expected a number of at most {MOST_DIGITS} digits, got one of {len(node.value)}"
+        raise yaml.MarkedYAMLError(problem=what, problem_mark=node.start_mark)
+    size = known[key] = 1 + sum(_size(part, known) for part in parts)
+    return size
 
 
 def value_of(root: yaml.Node | None) -> Any:
@@ -218,12 +268,16 @@ def read_model(model: type[Read], path: Path, what: str) -> Read:
         raise ConfigError([Fault(str(path), f"{what} cannot be read: {reason(error)}")]) from error
     except ValidationError as error:
         findings = validation_findings(model, error.errors())
-        raise ConfigError([Fault(f"{path}: {dotted(place)}", said) for place, said in findings]) from error
+        where = [f"{path}: {dotted(place)}" if place else str(path) for place, _ in findings]
+        faults = [Fault(at, said) for at, (_, said) in zip(where, findings, strict=True)]
+        raise ConfigError(faults) from error
 
 
 def reason(error: Exception) -> str:
-    """Return why something could not be read, without its path."""
-    return getattr(error, "strerror", None) or str(error)
+    """Return why something could not be read, in one line without its path."""
+    if isinstance(error, UnicodeDecodeError):
+        return "it is not UTF-8 text; save it as UTF-8"
+    return " ".join((getattr(error, "strerror", None) or str(error)).split())
 
 
 def _sentence(error: Mapping[str, Any]) -> str:

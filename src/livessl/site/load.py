@@ -19,6 +19,7 @@ from livessl.site.findings import (
     nodes_of,
     places_of,
     reason,
+    require_sane,
     unknown_key,
     validation_findings,
     value_of,
@@ -78,6 +79,7 @@ def parse_site(
     """
     try:
         root = nodes_of(text)
+        require_sane(root)
         locator = Locator(source, root)
         slips = list(quote_keys(root))
         data = value_of(root)
@@ -86,7 +88,8 @@ def parse_site(
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         where = f"{source}:{mark.line + 1}" if mark else source
-        raise ConfigError([Fault(where, f"not valid YAML: {getattr(error, 'problem', error)}")]) from error
+        what = getattr(error, "problem", None) or reason(error)
+        raise ConfigError([Fault(where, f"not valid YAML: {what}")]) from error
     if not isinstance(data, dict):
         raise ConfigError([Fault(source, "expected a mapping with the keys site, room and arrays")])
     if joint and isinstance(data.setdefault("joint", {}), dict):

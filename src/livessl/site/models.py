@@ -18,7 +18,7 @@ from livessl.core.stream.activity import ActivityParameters
 from livessl.core.stream.parameters import FusionParameters
 from livessl.core.types import MAX_MICROPHONES, MIN_MICROPHONES, ArraySpec, Uncertainty
 from livessl.site.alert_models import AlertsConfig
-from livessl.site.fields import BandHz, Bounds, Coordinate, FileName, Model, Position, Positive, ordered
+from livessl.site.fields import BandHz, Bounds, Coordinate, FileName, Model, Position, Positive, ordered, without_nul
 from livessl.site.node_models import NodeConfig
 from livessl.site.server_models import ServerConfig, StoreConfig
 from livessl.site.zone_models import FloorPlan, Zone
@@ -173,7 +173,7 @@ class ArrayConfig(Model):
         if isinstance(geometry, dict):
             return Shape.model_validate(geometry)
         if geometry is None or isinstance(geometry, str):
-            return geometry
+            return geometry and without_nul(geometry)
         raise ValueError("expected a shape such as {tetrahedron: {edge_m: 0.5}} or the path of a geometry file")
 
     @model_validator(mode="after")

@@ -42,7 +42,7 @@ class SceneDeviceConfig(Model):
     type: Literal["scene"]
     rt60_s: Annotated[float, Field(ge=0, le=100)] = 0.7
     events: Annotated[int, Field(ge=1)] = 8
-    seed: int = 0
+    seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = 0
     sample_rate_hz: Positive = 44100.0
     loop: bool = True
 

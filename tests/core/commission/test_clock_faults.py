@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from livessl.core.commission.clocks import LEAST_SOUNDS, Rises, find_clock_faults
-from livessl.core.commission.envelopes import HOP_S, EnvelopeMeter
+from livessl.core.commission.envelopes import HOP_S, MOST_GAP_S, EnvelopeMeter
 from livessl.core.commission.finding import Finding
 from livessl.core.types import FloatArray
 from livessl.examination import examine_parts
@@ -139,6 +139,18 @@ def test_gap_keeps_time_and_is_no_rise(seed: int, gap_s: float) -> None:
     rises = meter.rises()
     assert abs(float(rises.argmax()) * HOP_S - (later + 4_000) / 8_000.0) <= HOP_S
     assert np.count_nonzero(rises > 1.0) <= 2
+
+
+@pytest.mark.parametrize("gap_s", [MOST_GAP_S + 1.0, 1.8e9])
+def test_recording_is_measured_up_to_a_gap_of_decades(gap_s: float) -> None:
+    """As of a machine whose clock begins in 1970 and is set while it records."""
+    sound = (1e-3 * np.random.default_rng(3).standard_normal((4, 8_000))).astype(np.float32)
+    meter = EnvelopeMeter(8_000.0)
+    meter.push(0, sound)
+    before = meter.rises()
+    meter.push(8_000 + round(gap_s * 8_000.0), sound)
+    meter.push(16_000 + round(gap_s * 8_000.0), sound)
+    assert meter.rises().tolist() == before.tolist()
 
 
 def test_one_noisy_and_one_dead_channel_do_not_hide_the_rises() -> None:

@@ -10,9 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from free_field import C_M_S, RATE_HZ, burst, heard, tetra
+from livessl.core.correlate.onset_gcc import OnsetGCC
 from livessl.core.geometry import Grid
+from livessl.core.locate.background import FAR_BELOW, LOUD, loud_frames
 from livessl.core.locate.confidence import LEAST_CONFIDENCE, ConfidenceFeatures
 from livessl.core.locate.estimator import Course, Localization, Sound
+from livessl.core.locate.frame_gccs import BEGINNING
 from livessl.core.locate.onset import Onset
 from livessl.core.types import FRAME_S, Float32Array, FloatArray
 
@@ -88,3 +91,71 @@ def test_the_confidence_falls_with_the_share_of_the_background() -> None:
     assert shares[2] < LEAST_CONFIDENCE < shares[0]
     assert not replace(clear, background=1.0).is_sure
     assert replace(clear, background=1e6).confidence < 1e-9  # and no warning of an overflow
+
+
+def weighing(powers: list[float], quiet: int) -> Sound:
+    """Return a sound with these powers of its frames, of which the first are quiet."""
+    course = Course(np.arange(len(powers)), np.array(powers), quiet)
+    onset = OnsetGCC(np.zeros((6, 3), dtype=np.float32), np.ones(4))
+    return Sound((), RATE_HZ, [onset] * len(powers), course=course)
+
+
+@given(
+    quiet=st.integers(BEGINNING + 1, 10),
+    powers=st.lists(st.floats(0.2, 5.0), min_size=1, max_size=30),
+    background=st.floats(2.0 * FAR_BELOW, 10.0),
+)
+def test_loud_frames_are_those_that_are_nearly_as_loud_as_the_loudest(
+    quiet: int, powers: list[float], background: float
+) -> None:
+    level = background * float(np.mean(powers))
+    chosen = set(loud_frames(weighing([level] * (quiet - BEGINNING) + [0.0] * BEGINNING + powers, quiet)))
+    least = LOUD * max(powers)
+    assert chosen == {quiet + k for k, power in enumerate(powers) if power >= least}
+
+
+def test_no_frame_is_loud_beside_a_weak_or_unknown_background() -> None:
+    powers = [1.0, 0.1, 1.0]
+    assert list(loud_frames(weighing([0.2] * 8 + powers, 8))) == [8, 10]
+    assert not loud_frames(weighing([0.01 * FAR_BELOW] * 8 + powers, 8))
+    assert not loud_frames(weighing(powers, 0))
+    assert not loud_frames(replace(weighing([0.2] * 8 + powers, 8), course=None))
+
+
+def doubtful(seed: int, *, noise: float, looks: bool) -> Localization:
+    """Locate a burst of two frames in noise of this root mean square, 48 frames long; that of the burst is 0.03."""
+    rng = np.random.default_rng(seed)
+    frames = QUIET + 3 * ACTIVE
+    own = np.zeros(frames * FRAME)
+    sounding = slice(QUIET * FRAME, (QUIET + 2) * FRAME)
+    own[sounding] = burst(2 * FRAME, seed + 1)
+    own *= 0.03 / np.sqrt(np.square(own[sounding]).mean())
+    estimator, sounds = Onset(ARRAYS, GRID, C_M_S), {}
+    for spec in ARRAYS:
+        clean = heard(spec, SOURCE_M, own)
+        samples: Float32Array = clean + np.float32(noise) * rng.standard_normal(clean.shape, dtype=np.float32)
+        parts = np.split(samples, frames, axis=1)
+        listener = estimator.onset_front_end(spec.name, RATE_HZ)
+        onsets = [listener.push(part, quiet=k < QUIET) for k, part in enumerate(parts)]
+        course = Course(np.arange(frames), np.array([float(np.square(part).mean()) for part in parts]), QUIET)
+        active = samples[:, QUIET * FRAME :]
+        sounds[spec.name] = Sound((active,), RATE_HZ, onsets, course=course, second_looks=looks)
+    return estimator.locate(sounds)
+
+
+def test_a_doubtful_sound_in_noise_is_found_by_its_loud_frames() -> None:
+    without, found = (doubtful(2, noise=0.08, looks=looks) for looks in (False, True))
+    assert without.refused is not None
+    assert apart_m(without, SOURCE_M) > 1.0
+    assert found.refused is None
+    assert apart_m(found, SOURCE_M) < 0.2
+    assert found.features is not None
+    assert not found.features.whole  # loud frames, not whole segments
+
+
+@given(seed=st.integers(1, 100), noise=st.floats(0.04, 0.1))
+@settings(max_examples=3, deadline=None)
+def test_another_look_never_makes_a_sound_less_certain(seed: int, noise: float) -> None:
+    without, found = (doubtful(seed, noise=noise, looks=looks) for looks in (False, True))
+    assert found.refused is None or without.refused is not None
+    assert found.confidence >= without.confidence or without.refused is not None

@@ -85,7 +85,7 @@ def test_array_that_is_away_delays_no_early_event_and_corrects_the_final_one() -
     (late,) = settled_events(said)
     assert (late.heard_by, late.late) == (NAMES, True)
     assert late.latency_s == pytest.approx((111 - 46) * 0.05)
-    assert into.backlog_frames == {"north": 0, "south": len(kept)}
+    assert into.input.backlog_frames == {"north": 0, "south": len(kept)}
 
 
 def test_array_that_is_away_is_awaited_for_a_limited_time() -> None:
@@ -100,7 +100,7 @@ def test_array_that_is_away_is_awaited_for_a_limited_time() -> None:
     # the frames that the other has kept come too late, and are counted
     into.greet("south", (START + 38, START + 52), now_ns(300))
     play(into, [(301.0, frame("south", k)) for k in range(40, 46)], 301, 301)
-    assert into.too_late == {"north": 0, "south": 6}
+    assert into.input.too_late == {"north": 0, "south": 6}
 
 
 def test_hold_is_longer_than_a_restart_takes() -> None:
@@ -112,7 +112,7 @@ def test_memory_of_held_frames_is_bounded() -> None:
     into = two_passes(hold_bytes=50 * size)
     play(into, node("south", (), range(5)), 5)
     said = play(into, node("north", range(10, 400), range(5, 420)), 420, 5)
-    assert into.held_bytes <= 50 * size
+    assert into.input.held.nbytes <= 50 * size
     assert len(settled_events(said)) >= 1
 
 
@@ -149,7 +149,7 @@ def test_settled_events_are_not_reported_again_after_a_restart() -> None:
     said += play(again, [(w, m) for w, m in both(range(40, 46), range(32, 60)) if w >= 32], 60, 32)
     (event,) = settled_events(said)
     assert event.start_ns == (START + 40) * FRAME_NS
-    assert sum(again.duplicates.values()) == sum(m.frame_index < output.until for _, m in kept)
+    assert sum(again.input.duplicates.values()) == sum(m.frame_index < output.until for _, m in kept)
 
 
 def test_final_pass_begins_anew_when_the_servers_clock_is_set_back() -> None:

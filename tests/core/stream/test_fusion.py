@@ -546,13 +546,13 @@ def test_live_fusion_that_is_behind_locates_only_the_newest_window() -> None:
     site = Fusion(state_of(), Role(newest_only=True))
     said = play(site, arrivals, 16)  # in step: nothing is left out
     assert len([output for _, output in said if isinstance(output, Update)]) == 3
-    assert site.updates_left_out == 0
+    assert site.updates.left_out == 0
     behind = Fusion(state_of(), Role(newest_only=True))
     told = behind.step(
         [message for when, message in sorted(arrivals, key=lambda arrival: arrival[0]) if when <= 17], now_ns(17)
     )
     assert [output.complete_ns for output in told if isinstance(output, Update)] == [now_ns(16)]
-    assert behind.updates_left_out == 2
+    assert behind.updates.left_out == 2
 
 
 def test_events_only_role_gives_no_updates() -> None:

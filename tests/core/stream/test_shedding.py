@@ -139,7 +139,7 @@ def test_of_the_updates_of_a_sound_some_are_left_out(every: int | None) -> None:
     outputs = run(fusion, sound(set(range(10, 50)), 70, 0, 4))
     updates = sum(isinstance(output, Update) for output in outputs)
     assert updates == (0 if every is None else 20 // every)
-    assert fusion.updates_shed == 20 - updates
+    assert fusion.updates.shed == 20 - updates
     assert len(events(outputs)) == 1
 
 

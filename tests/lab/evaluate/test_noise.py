@@ -16,7 +16,7 @@ from livessl.core.locate.confidence import ConfidenceFeatures
 from livessl.lab.evaluate.campaign import run_campaign
 from livessl.lab.evaluate.job import Job, read_clips
 from livessl.lab.evaluate.localizer import METHODS
-from livessl.lab.evaluate.localizer_report import Columns, read_columns
+from livessl.lab.evaluate.localizer_report import Columns, SummaryRow, read_columns
 from livessl.lab.evaluate.noise import APART_M, FACING, WHERE, NoisePosition, NoiseSettings, where
 from livessl.lab.evaluate.noise_fit import noise_fit
 from livessl.lab.evaluate.noise_kinds import FROM_ONE_PLACE, KINDS, make_noise
@@ -104,6 +104,11 @@ def test_rooms_hold_their_arrays_and_can_have_their_reverberation(half: str) -> 
         assert 0.0 < absorption(room.rt60_s, room.size_m) < 1.0
 
 
+def at_levels(rows: list[SummaryRow]) -> list[SummaryRow]:
+    """Return the rows of `onset` in each room at each level."""
+    return [row for row in rows if row["room"] != ALL and row["snr_db"] != ALL and row["method"] == "onset"]
+
+
 def test_report_counts_right_and_wrong_sounds(folder: Path, columns: Columns) -> None:
     rows = summary(columns)
     cells = [row for row in rows if row["noise"] != ALL]
@@ -112,6 +117,9 @@ def test_report_counts_right_and_wrong_sounds(folder: Path, columns: Columns) ->
         assert row["sounds"] == len(CLASSES)
         assert row["right"] + row["wrong"] * row["located"] == pytest.approx(row["located"], abs=1e-3)
         assert row["right_low"] <= row["right"] <= row["right_high"]
+    assert [row["sounds"] for row in at_levels(rows)] == [len(CLASSES) * len(PLAYED)] * len(SNRS_DB)
+    for row in at_levels(rows):
+        assert row["withheld"] == pytest.approx(row["near"] - row["right"], abs=1e-3)
     written = write_noise_report(folder)
     text = written[1].read_text(encoding="utf-8")
     assert "canteen" in text
@@ -135,6 +143,8 @@ def test_cells_that_fall_short_are_named(columns: Columns) -> None:
     refused = right | {"located": ~ours}
     assert not too_wrong(summary(refused))
     assert [row["noise"] for row in below_standard(summary(refused))] == ["fan"]
+    withheld = {row["snr_db"]: row["withheld"] for row in at_levels(summary(refused))}
+    assert withheld == {20.0: pytest.approx(1.0 / len(PLAYED)), 5.0: 0.0}
 
 
 def test_confidence_is_compared_with_the_truth(columns: Columns) -> None:

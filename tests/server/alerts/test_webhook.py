@@ -204,7 +204,7 @@ def test_anything_but_an_answer_of_http_is_a_failed_attempt(tmp_path: Path, answ
         serving.join(timeout=HANG_S)
         held[0].close()
     assert dead.error is not None
-    expected = "no answer within 0.5 s" if answer is None else "expected an answer of HTTP|cannot reach"
+    expected = "no answer within 0.5 s" if answer is None else "expected an HTTP answer|cannot reach"
     assert any(dead.error.startswith(part) for part in expected.split("|"))
 
 

@@ -13,6 +13,7 @@ from playwright.sync_api import Browser, Page, expect
 
 from alert_desk import after, alert_site, sound
 from browser import faultless_page, running_browser, visit
+from clip_desk import recordings
 from hub_desk import make_hub, running_hub
 from livessl.clock import utc_text
 from livessl.core.stream.final_pass import FinalResults
@@ -120,7 +121,9 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Desk]:
             "loud": {"events": {"min_level_dbfs": 0}, "armed": False},
         },
     )
-    ClipFolder(folder / "clips").put("small-past-3", _recordings)
+    ClipFolder(folder / "clips").put(
+        "small-past-3", recordings(START_NS, {"enhanced.flac": b"", "array-north.flac": b""})
+    )
     with pytest.MonkeyPatch.context() as patch, running_server(site) as server:
         patch.setattr(ArrayStates, "describe", _in_chosen_states(ArrayStates.describe))
         patch.setattr(Overload, "message", property(lambda _: "overloaded: it sheds some updates"))
@@ -169,19 +172,6 @@ def _fill(server: Server) -> None:
     alerting = sound(1)
     server.parts.event_log.add_final(FinalResults((alerting,), after(alerting)), messages, {})
     wait_until(lambda: server.parts.alerts.outbox.dead(1), "the alert that was not delivered")
-
-
-def _recordings(folder: Path) -> JsonObject:
-    """Recordings that nobody plays."""
-    (folder / "array-north.flac").write_bytes(b"")
-    (folder / "enhanced.flac").write_bytes(b"")
-    shared = {"sample_rate_hz": 16000, "duration_s": 1.5, "bytes": 0, "time_utc": utc_text(START_NS)}
-    shared |= {"pre_roll_s": 1.0, "post_roll_s": 0.5, "gaps_s": [[0.1, 0.2]], "gain_db": 12.0, "beams": []}
-    files = [
-        {"name": "enhanced.flac", "kind": "enhanced", "array": None, "channels": 1, **shared},
-        {"name": "array-north.flac", "kind": "array", "array": "north", "channels": 4, **shared},
-    ]
-    return {"start_ns": START_NS, "position_m": [2.0, 2.0, 1.0], "files": files}
 
 
 def opened(page: Page, url: str, token: str | None = None) -> None:

@@ -3,74 +3,45 @@
 from __future__ import annotations
 
 import io
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import httpx
 import numpy as np
 import pytest
 import soundfile
 
+from clip_desk import ServedClips, served_clips
 from livessl.clock import utc_ns
 from livessl.core.types import Float32Array
 from livessl.errors import ConfigError
-from livessl.server.app import Server
-from livessl.site.tokens import Role, add_token
+from livessl.server.api.clip_schema import EventClips
+from livessl.site.tokens import Role
 from scene_server import capture_scene, replay_scene
 from small_site import RATE_HZ, Changes, heard, running_server, scene, site_of, wait_until
 
 pytestmark = pytest.mark.usefixtures("nothing_is_shed")
 
 CLIPS: Changes = {"server.clips": {"folder": "clips", "pre_s": 0.6, "post_s": 0.2}}
-ROLES: tuple[Literal["viewer", "operator"], ...] = ("viewer", "operator")
-
-
-class Desk:
-    """A server whose clips are stored, and clients of it."""
-
-    def __init__(self, server: Server, directory: Path, tokens: dict[str, str]) -> None:
-        self.server = server
-        self.folder = directory / "clips"
-        self.tokens = tokens
-
-    def ask(self, path: str, method: str = "GET", role: str = "operator", **more: Any) -> httpx.Response:
-        headers = {"Authorization": f"Bearer {self.tokens[role]}", **more.pop("headers", {})}
-        return httpx.request(method, f"{self.server.url}/api/v1/{path}", headers=headers, timeout=100, **more)
-
-    def get(self, path: str, role: str = "operator", **query: Any) -> dict[str, Any]:
-        answer = self.ask(path, role=role, params=query)
-        assert answer.status_code == 200, answer.text
-        found: dict[str, Any] = answer.json()
-        return found
-
-    def events(self) -> list[dict[str, Any]]:
-        """All events, oldest first."""
-        found: list[dict[str, Any]] = self.get("events")["events"]
-        return found[::-1]
-
-    def sound(self, event_id: str, name: str, **query: Any) -> tuple[Float32Array, int]:
-        """The samples (channels, n) of a recording, and its rate."""
-        answer = self.ask(f"events/{event_id}/clips/{name}", params=query)
-        assert answer.status_code == 200, answer.text
-        samples, rate_hz = soundfile.read(io.BytesIO(answer.content), dtype="float32", always_2d=True)
-        return samples.T, int(rate_hz)
 
 
 @pytest.fixture(scope="module")
-def desk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Desk]:
-    directory = tmp_path_factory.mktemp("site")
-    tokens: dict[str, str] = {role: add_token(directory / "tokens.yaml", role, role) for role in ROLES}
-    site = site_of({**CLIPS, "server.http.tokens": "tokens.yaml"}, directory)
-    with running_server(site) as server:
-        capture_scene(server)
-        assert server.parts.clips is not None
-        counts = server.parts.clips.counts
-        wait_until(lambda: counts.written == 2, "both clips")
-        yield Desk(server, directory, tokens)
+def desk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServedClips]:
+    with served_clips(tmp_path_factory.mktemp("site"), pre_s=0.6, post_s=0.2) as desk:
+        yield desk
 
 
-def test_every_located_event_has_its_sound_and_the_enhanced_one(desk: Desk) -> None:
+def sound(desk: ServedClips, event_id: str, name: str, **query: Any) -> tuple[Float32Array, int]:
+    """The samples (channels, n) of a recording, and its rate."""
+    answer = desk.ask(f"events/{event_id}/clips/{name}", params=query)
+    assert answer.status_code == 200, answer.text
+    samples, rate_hz = soundfile.read(io.BytesIO(answer.content), dtype="float32", always_2d=True)
+    return samples.T, int(rate_hz)
+
+
+def test_every_located_event_has_its_sound_and_the_enhanced_one(desk: ServedClips) -> None:
     events = desk.events()
     assert [event["status"] for event in events] == ["located", "located"]
     for event in events:
@@ -79,7 +50,7 @@ def test_every_located_event_has_its_sound_and_the_enhanced_one(desk: Desk) -> N
         names = [file["name"] for file in found["files"]]
         assert names == ["enhanced.flac", "array-north.flac", "array-south.flac"]
         for file in found["files"]:
-            samples, rate_hz = desk.sound(event["id"], file["name"])
+            samples, rate_hz = sound(desk, event["id"], file["name"])
             assert (len(samples), rate_hz) == (file["channels"], file["sample_rate_hz"]) == (len(samples), RATE_HZ)
             assert samples.shape[1] / RATE_HZ == pytest.approx(file["duration_s"], abs=1e-3)
             whole_s = file["pre_roll_s"] + event["duration_s"] + file["post_roll_s"]
@@ -93,13 +64,13 @@ def place_in(truth: Float32Array, samples: Float32Array) -> int:
     return int(np.abs(windows - samples[:, None, :8]).sum(axis=(0, 2)).argmin())
 
 
-def test_recording_of_an_array_is_what_its_microphones_received(desk: Desk) -> None:
+def test_recording_of_an_array_is_what_its_microphones_received(desk: ServedClips) -> None:
     """Sample by sample, at its time: 24 bits of a file of 32."""
     for number, event in enumerate(desk.events()):
         for name in ("north", "south"):
             found = desk.get(f"events/{event['id']}/clips")
             [file] = [file for file in found["files"] if file["array"] == name]
-            samples, _ = desk.sound(event["id"], file["name"])
+            samples, _ = sound(desk, event["id"], file["name"])
             source, truth = scene().sources[number], heard(name)
             lag = place_in(truth, samples)
             np.testing.assert_allclose(samples, truth[:, lag : lag + samples.shape[1]], atol=2**-22)
@@ -110,29 +81,29 @@ def test_recording_of_an_array_is_what_its_microphones_received(desk: Desk) -> N
             assert -0.06 < begin_s - source.start_s < 0.06
 
 
-def test_enhanced_sound_is_clearer_than_the_best_microphone(desk: Desk) -> None:
+def test_enhanced_sound_is_clearer_than_the_best_microphone(desk: ServedClips) -> None:
     for event in desk.events():
         found = desk.get(f"events/{event['id']}/clips")
         enhanced, *arrays = found["files"]
         ratios = []
         for file in (enhanced, *arrays):
-            samples, rate_hz = desk.sound(event["id"], file["name"])
+            samples, rate_hz = sound(desk, event["id"], file["name"])
             begin = round(file["pre_roll_s"] * rate_hz)
             quiet = samples[:, : begin - round(0.08 * rate_hz)]
             during = samples[:, begin : begin + round(event["duration_s"] * rate_hz)]
             ratios.append((np.square(during).mean(axis=1) / np.square(quiet).mean(axis=1)).max())
         assert 10.0 * np.log10(ratios[0] / max(ratios[1:])) > 3.0
-        samples, _ = desk.sound(event["id"], enhanced["name"])
+        samples, _ = sound(desk, event["id"], enhanced["name"])
         assert np.abs(samples).max() == pytest.approx(10 ** (-3 / 20), abs=1e-3)
 
 
-def test_time_of_the_enhanced_sound_is_that_of_its_emission(desk: Desk) -> None:
+def test_time_of_the_enhanced_sound_is_that_of_its_emission(desk: ServedClips) -> None:
     event = desk.events()[0]
     enhanced, *arrays = desk.get(f"events/{event['id']}/clips")["files"]
     assert utc_ns(enhanced["time_utc"]) < min(utc_ns(file["time_utc"]) for file in arrays)
 
 
-def test_recording_comes_whole_in_parts_and_as_wav(desk: Desk) -> None:
+def test_recording_comes_whole_in_parts_and_as_wav(desk: ServedClips) -> None:
     event = desk.events()[0]
     address = f"events/{event['id']}/clips/array-north.flac"
     whole = desk.ask(address)
@@ -146,13 +117,13 @@ def test_recording_comes_whole_in_parts_and_as_wav(desk: Desk) -> None:
     wav = desk.ask(address, params={"format": "wav"})
     assert (wav.headers["content-type"], wav.content[:4]) == ("audio/wav", b"RIFF")
     np.testing.assert_array_equal(
-        desk.sound(event["id"], "array-north.flac", format="wav")[0], desk.sound(event["id"], "array-north.flac")[0]
+        sound(desk, event["id"], "array-north.flac", format="wav")[0], sound(desk, event["id"], "array-north.flac")[0]
     )
     head = desk.ask(address, "HEAD")
     assert (head.status_code, head.content) == (200, b"")
 
 
-def test_viewer_sees_that_there_is_sound_and_does_not_get_it(desk: Desk) -> None:
+def test_viewer_sees_that_there_is_sound_and_does_not_get_it(desk: ServedClips) -> None:
     event = desk.events()[0]
     listed = desk.get(f"events/{event['id']}/clips", role="viewer")
     assert listed == desk.get(f"events/{event['id']}/clips")
@@ -166,7 +137,7 @@ def test_viewer_sees_that_there_is_sound_and_does_not_get_it(desk: Desk) -> None
         assert desk.ask(path, method, "viewer", json=body).status_code == 403, (method, path)
 
 
-def test_unknown_names_lead_nowhere(desk: Desk) -> None:
+def test_unknown_names_lead_nowhere(desk: ServedClips) -> None:
     event = desk.events()[0]["id"]
     assert desk.get("events/nothing/clips")["state"] == "none"
     for path in (f"{event}/clips/clip.json", f"{event}/clips/..%2f..%2ftokens.yaml", "nothing/clips/enhanced.flac"):
@@ -175,7 +146,61 @@ def test_unknown_names_lead_nowhere(desk: Desk) -> None:
     assert desk.ask("events/nothing/clips/keep", "PUT", json={"keep": True}).status_code == 404
 
 
-def test_figures_are_in_the_api_and_the_metrics(desk: Desk) -> None:
+DAMAGES: dict[str, Any] = {
+    "empty": lambda _: b"",
+    "cut short": lambda whole: whole[: len(whole) // 2],
+    "foreign": lambda _: b'{"title": "holiday"}',
+    "no list of files": lambda whole: whole.replace(b'"files"', b'"sound"'),
+    "file elsewhere": lambda whole: whole.replace(b"enhanced.flac", b"../../tokens.yaml"),
+    "file of an unknown kind": lambda whole: whole.replace(b"enhanced.flac", b"enhanced.mp3"),
+}
+
+
+def test_event_with_an_unreadable_clip_is_served_and_says_why(desk: ServedClips) -> None:
+    event = desk.events()[0]["id"]
+    path = desk.folder / event / "clip.json"
+    whole = path.read_bytes()
+    for name, damage in DAMAGES.items():
+        path.write_bytes(damage(whole))
+        found = desk.get(f"events/{event}/clips", role="viewer")
+        EventClips.model_validate(found)
+        assert (found["state"], found["files"], found["methods"], found["keep"]) == ("unreadable", [], [], False), name
+        assert found["problem"].startswith(f"event '{event}': expected a clip.json that this release can read"), name
+        for method, end, body in (
+            ("GET", "clips/enhanced.flac", None),
+            ("GET", "clips/best", None),
+            ("PUT", "clips/keep", {"keep": True}),
+            ("POST", "relocate", {}),
+        ):
+            answer = desk.ask(f"events/{event}/{end}", method, json=body)
+            assert (answer.status_code, answer.json()["detail"]) == (409, found["problem"]), (name, end)
+        assert desk.ask(f"events/{event}").status_code == 200
+        assert desk.get("clips")["unreadable"] == 1
+    path.write_bytes(whole)
+    assert desk.get(f"events/{event}/clips")["problem"] is None
+    assert desk.get("clips")["unreadable"] == 0
+
+
+def test_damaged_recording_is_refused_where_it_would_be_decoded(desk: ServedClips) -> None:
+    event = desk.events()[0]["id"]
+    path = desk.folder / event / "array-north.flac"
+    whole = path.read_bytes()
+    path.write_bytes(b"fLaC")
+    answer = desk.ask(f"events/{event}/clips/array-north.flac", params={"format": "wav"})
+    assert (answer.status_code, "array-north.flac cannot be read" in answer.json()["detail"]) == (409, True)
+    path.write_bytes(whole)
+
+
+def test_unreadable_clip_is_deleted_as_any_other(desk: ServedClips, tmp_path: Path) -> None:
+    event = desk.events()[1]["id"]
+    shutil.copytree(desk.folder / event, tmp_path / event)
+    (desk.folder / event / "clip.json").write_bytes(b"")
+    assert desk.ask(f"events/{event}/clips", "DELETE").status_code == 200
+    assert desk.get(f"events/{event}/clips")["state"] == "none"
+    (tmp_path / event).rename(desk.folder / event)  # for the other tests
+
+
+def test_figures_are_in_the_api_and_the_metrics(desk: ServedClips) -> None:
     found = desk.get("clips", role="viewer")
     size = sum(path.stat().st_size for path in desk.folder.rglob("*.flac"))
     assert {name: found[name] for name in ("enabled", "written", "incomplete", "without_sound", "shed", "failed")} == {

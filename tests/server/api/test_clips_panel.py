@@ -119,6 +119,21 @@ def test_viewer_sees_what_there_is_and_gets_no_button(
         clips = page.get_by_test_id("clips").last
         expect(clips).to_contain_text("Sign in as an operator to listen.", timeout=1000 * HANG_S)
         expect(clips.get_by_role("button")).to_have_count(0)
+        assert server.parts.clips is not None
+        event_id = server.parts.clips.folder.ids()[0]  # of the oldest event, which is the last of the list
+        about = tokens[0] / "clips" / event_id / "clip.json"
+        whole = about.read_bytes()
+        about.write_bytes(whole[:100])
+        page.reload()
+        expect(page.get_by_test_id("event")).to_have_count(2, timeout=1000 * HANG_S)
+        page.get_by_test_id("event").last.locator(".summary").click()
+        problem = page.get_by_test_id("clip-problem")
+        expect(problem).to_contain_text("cannot be read. event", timeout=1000 * HANG_S)
+        expect(problem).to_contain_text("it is not JSON")
+        for width in (1440, 390):
+            page.set_viewport_size({"width": width, "height": 900})
+            assert page.evaluate(CLIPPED) == [], width
+        about.write_bytes(whole)  # for the other tests
 
 
 def test_operator_locates_an_event_again_and_sees_both_answers(

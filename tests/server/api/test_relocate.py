@@ -8,73 +8,34 @@ import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import httpx
 import numpy as np
 import pytest
 
+from clip_desk import ServedClips, served_clips
+from livessl.cli.main import main
 from livessl.core.types import Frame
-from livessl.server.app import Server
 from livessl.server.clips import relocate as relocation
 from livessl.server.clips.stored_sound import stored_frames
 from livessl.server.overload import Overload
-from livessl.site.tokens import add_token
 from messages import event_message
-from scene_server import capture_scene
-from small_site import HANG_S, Changes, running_server, scene, site_of, wait_until
+from small_site import HANG_S, Changes, running_server, scene, site_of
 
 pytestmark = pytest.mark.usefixtures("nothing_is_shed")
 
-CLIPS: Changes = {"server.clips": {"folder": "clips", "enhanced": False}, "server.http.tokens": "tokens.yaml"}
-ROLES: tuple[Literal["viewer", "operator"], ...] = ("viewer", "operator")
-
-
-class Desk:
-    """A server whose clips are stored, and clients of it."""
-
-    def __init__(self, server: Server, directory: Path, tokens: dict[str, str]) -> None:
-        self.server = server
-        self.folder = directory / "clips"
-        self._tokens = tokens
-
-    def ask(self, method: str, path: str, body: Any = None, role: str = "operator") -> httpx.Response:
-        headers = {"Authorization": f"Bearer {self._tokens[role]}"}
-        return httpx.request(method, f"{self.server.url}/api/v1/{path}", headers=headers, json=body, timeout=100)
-
-    def events(self) -> list[dict[str, Any]]:
-        """All events, oldest first."""
-        found: list[dict[str, Any]] = self.ask("GET", "events").json()["events"]
-        return found[::-1]
-
-    def relocate(self, event_id: str, /, **wanted: Any) -> dict[str, Any]:
-        answer = self.ask("POST", f"events/{event_id}/relocate", wanted)
-        assert answer.status_code == 200, answer.text
-        found: dict[str, Any] = answer.json()
-        return found
-
-    def refusal(self, status: int, event_id: str, /, **wanted: Any) -> str:
-        answer = self.ask("POST", f"events/{event_id}/relocate", wanted)
-        assert answer.status_code == status, answer.text
-        return json.dumps(answer.json()["detail"])
-
 
 @pytest.fixture(scope="module")
-def desk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Desk]:
-    directory = tmp_path_factory.mktemp("site")
-    tokens: dict[str, str] = {role: add_token(directory / "tokens.yaml", role, role) for role in ROLES}
-    with running_server(site_of(CLIPS, directory)) as server:
-        capture_scene(server)
-        clips = server.parts.clips
-        assert clips is not None
-        wait_until(lambda: clips.counts.written == 2, "both clips")
-        yield Desk(server, directory, tokens)
+def desk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServedClips]:
+    with served_clips(tmp_path_factory.mktemp("site"), enhanced=False) as desk:
+        yield desk
 
 
-def test_answers_stand_beside_each_other(desk: Desk) -> None:
+def test_answers_stand_beside_each_other(desk: ServedClips) -> None:
     known = ["onset", "srp-phat", "cepstral", "averaged"]
     for event, source in zip(desk.events(), scene().sources, strict=True):
-        assert desk.ask("GET", f"events/{event['id']}/clips", role="viewer").json()["methods"] == known
+        assert desk.get(f"events/{event['id']}/clips", role="viewer")["methods"] == known
         found = desk.relocate(event["id"], method="srp-phat")
         stored, again = found["stored"], found["again"]
         for name in ("method", "status", "reason", "position_m", "covariance_m2", "confidence", "arrays", "candidates"):
@@ -88,7 +49,7 @@ def test_answers_stand_beside_each_other(desk: Desk) -> None:
             assert answer["std_m"] == pytest.approx(np.linalg.norm(answer["covariance_m2"], 2) ** 0.5, abs=1e-3)
 
 
-def test_event_stays_as_it_is(desk: Desk) -> None:
+def test_event_stays_as_it_is(desk: ServedClips) -> None:
     before = desk.events()
     found = desk.relocate(before[0]["id"])  # by its own method, with the poses of then
     assert (found["again"]["method"], found["set_up"], found["moved_arrays"]) == ("onset", "then", [])
@@ -97,17 +58,17 @@ def test_event_stays_as_it_is(desk: Desk) -> None:
     assert desk.events() == before
 
 
-def test_what_cannot_be_is_refused(desk: Desk) -> None:
+def test_what_cannot_be_is_refused(desk: ServedClips) -> None:
     event = desk.events()[0]["id"]
     assert "no event 'nothing'" in desk.refusal(404, "nothing")
     refusal = desk.refusal(422, event, method="os:system")
     assert "expected one of onset, srp-phat, cepstral, averaged, got 'os:system'" in refusal
     assert "then" in desk.refusal(422, event, set_up="tomorrow")
     assert "extra_forbidden" in desk.refusal(422, event, methods=["onset"])
-    assert desk.ask("POST", f"events/{event}/relocate", {}, "viewer").status_code == 403
+    assert desk.ask(f"events/{event}/relocate", "POST", "viewer", json={}).status_code == 403
 
 
-def test_one_event_at_a_time(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_event_at_a_time(desk: ServedClips, monkeypatch: pytest.MonkeyPatch) -> None:
     event = desk.events()[0]["id"]
     begun, may_end = threading.Event(), threading.Event()
     usual = relocation.relocate
@@ -130,7 +91,7 @@ def test_one_event_at_a_time(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> Non
     assert desk.relocate(event)["event_id"] == event
 
 
-def test_live_sound_comes_first(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_live_sound_comes_first(desk: ServedClips, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Overload, "message", "behind")
     refusal = desk.refusal(503, desk.events()[0]["id"])
     assert "the server is overloaded, and live sound comes first; try again when it is not" in refusal
@@ -149,7 +110,7 @@ def blocking_frames(monkeypatch: pytest.MonkeyPatch) -> tuple[threading.Event, t
     return begun, may_go_on
 
 
-def test_relocation_gives_way_when_an_overload_begins(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_relocation_gives_way_when_an_overload_begins(desk: ServedClips, monkeypatch: pytest.MonkeyPatch) -> None:
     event = desk.events()[0]["id"]
     begun, may_go_on = blocking_frames(monkeypatch)
     fusions: list[Any] = []
@@ -165,14 +126,14 @@ def test_relocation_gives_way_when_an_overload_begins(desk: Desk, monkeypatch: p
 
 
 def test_relocation_in_flight_does_not_delay_the_end(
-    desk: Desk, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    desk: ServedClips, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """The request is answered and the server ends while the computation still hangs in one of its steps."""
     event = desk.events()[0]
     shutil.copytree(desk.folder / event["id"], tmp_path / "clips" / event["id"])
     begun, may_go_on = blocking_frames(monkeypatch)
     with ThreadPoolExecutor(1) as pool:
-        with running_server(site_of({"server.clips": CLIPS["server.clips"]}, tmp_path)) as server:
+        with running_server(site_of({"server.clips": {"folder": "clips", "enhanced": False}}, tmp_path)) as server:
             server.parts.store.add(event_message(id=event["id"]), 1)
             url = f"{server.url}/api/v1/events/{event['id']}/relocate"
             waiting = pool.submit(httpx.post, url, json={"method": "onset"}, timeout=HANG_S)
@@ -186,14 +147,14 @@ def test_relocation_in_flight_does_not_delay_the_end(
     assert not hanging[0].is_alive()
 
 
-def test_sound_that_would_use_up_the_memory_is_refused(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sound_that_would_use_up_the_memory_is_refused(desk: ServedClips, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(relocation, "MOST_BYTES", 1000)
     refusal = desk.refusal(409, desk.events()[0]["id"])
     assert "too large for a running server" in refusal
     assert "locate the event with `livessl relocate`" in refusal
 
 
-def test_damaged_clip_is_refused(desk: Desk) -> None:
+def test_damaged_clip_is_refused(desk: ServedClips) -> None:
     event = desk.events()[0]["id"]
     path = desk.folder / event / "clip.json"
     whole = path.read_bytes()
@@ -205,21 +166,61 @@ def test_damaged_clip_is_refused(desk: Desk) -> None:
 
 
 def test_recordings_that_are_made_or_gone_are_told_apart(
-    desk: Desk, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    desk: ServedClips, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     event = desk.events()[1]["id"]
-    clips = desk.server.parts.clips
-    assert clips is not None
     shutil.copytree(desk.folder / event, tmp_path / event)
     with monkeypatch.context() as patch:
-        patch.setattr(clips, "is_waiting", lambda _: True)
+        patch.setattr(desk.clips, "is_waiting", lambda _: True)
         assert "are being made; try again in some seconds" in desk.refusal(409, event)
     (desk.folder / event / "array-north.flac").write_bytes(b"")
     assert "array-north.flac cannot be read" in desk.refusal(409, event)
-    assert desk.ask("DELETE", f"events/{event}/clips").status_code == 200
+    assert desk.ask(f"events/{event}/clips", "DELETE").status_code == 200
     assert "has no recordings; it cannot be located again without its sound" in desk.refusal(404, event)
-    assert desk.ask("GET", f"events/{event}/clips").json()["methods"] == []
+    assert desk.get(f"events/{event}/clips")["methods"] == []
     (tmp_path / event).rename(desk.folder / event)  # for the other tests
+
+
+def test_command_has_the_server_locate_its_events(
+    desk: ServedClips, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first, second = desk.events()
+    token, out = tmp_path / "token", tmp_path / "answers.jsonl"
+    token.write_text(desk.tokens["operator"], encoding="utf-8")
+    at_server = ["relocate", "--url", desk.server.url, "--token-file", str(token)]
+    command = [*at_server, "--json", "--out", str(out), "--method", "srp-phat"]
+    clip = desk.folder / first["id"] / "clip.json"
+    whole = clip.read_bytes()
+    clip.write_bytes(b"")
+    assert main(command) == 1
+    damaged, located = map(json.loads, capsys.readouterr().out.splitlines())
+    assert (damaged["event_id"], damaged["again"], located["error"]) == (first["id"], None, None)
+    assert "expected a clip.json that this release can read, got another one: it is empty" in damaged["error"]
+    assert (located["time_utc"], located["stored"]["method"]) == (second["time_utc"], "onset")
+    assert (located["again"]["method"], located["again"]["status"]) == ("srp-phat", "located")
+    assert 0.0 < located["distance_m"] < 0.2
+    clip.write_bytes(whole)
+    assert main(command) == 0  # only what has failed
+    assert [json.loads(line)["event_id"] for line in capsys.readouterr().out.splitlines()] == [first["id"]]
+    assert [json.loads(line)["event_id"] for line in out.read_text().splitlines()] == [second["id"], first["id"]]
+    assert main([*command, "--set-up", "now"]) == 2
+    assert "has answers of --method srp-phat --set-up then; name another file" in capsys.readouterr().err
+    assert main([*at_server, "--until", first["time_utc"], "--method", "os:system"]) == 1
+    assert "expected one of onset, srp-phat, cepstral, averaged, got 'os:system'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ([], "expected --site FILE or --url ADDRESS, got neither; give one"),
+        (["--url", "http://127.0.0.1:9", "--jobs", "2", "clips"], "expected no folder and no --jobs with --url"),
+    ],
+)
+def test_command_needs_a_site_file_or_a_server(
+    options: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["relocate", *options]) == 2
+    assert said in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from alert_desk import PATIENT, after, alert_site, encoded, sound
+from clip_desk import recordings
 from livessl.clock import UnpacedClock, utc_ns
 from livessl.core.stream.final_pass import FinalResults
 from livessl.schema.alerts import OpenLinks
@@ -66,9 +67,7 @@ class Desk:
         return self.alerted(event.id)
 
 
-def _recording(folder: Path) -> JsonObject:
-    (folder / "enhanced.flac").write_bytes(SOUND)
-    return {"start_ns": NOW_NS, "files": [{"name": "enhanced.flac", "bytes": len(SOUND)}]}
+_recording = recordings(NOW_NS, {"enhanced.flac": SOUND})
 
 
 @contextmanager
@@ -141,7 +140,7 @@ def test_link_opens_its_path_only_and_only_for_reading(desk: Desk) -> None:
         assert desk.status(links["clip"], method) == 401, method
     clips = desk.server.parts.clips
     assert clips is not None
-    assert clips.folder.about("small-2") is not None
+    assert clips.folder.read("small-2") is not None
 
 
 def test_changed_link_is_refused_and_a_token_still_works_with_it(desk: Desk) -> None:
@@ -255,20 +254,29 @@ def test_alert_without_a_place_or_a_recording_has_no_link_to_one() -> None:
 IDS = st.from_regex(r"[A-Za-z0-9_-]{1,20}", fullmatch=True)
 
 
+class ClockThatIsSet(UnpacedClock):
+    """A clock that shows what it is set to, also an earlier time."""
+
+    shown_ns = NOW_NS
+
+    def now_ns(self) -> int:
+        return self.shown_ns
+
+
 @given(IDS, IDS, st.floats(60, 1e6), st.floats(-1e5, 1e5))
 def test_link_is_valid_until_it_expires_for_its_path_and_secret_only(
     one: str, other: str, lifetime_s: float, offset_s: float
 ) -> None:
-    links = SignedLinks(UnpacedClock(NOW_NS), None)
+    clock = ClockThatIsSet()
+    links = SignedLinks(clock, None)
     link, expires_ns = links.sign(f"/api/v1/events/{one}/clips/best", lifetime_s)
     query = httpx.URL(link).params
     at_ns = expires_ns + round(offset_s * 1e9)
-    later = SignedLinks(UnpacedClock(max(0, at_ns)), None)
-    later._key = links._key
+    clock.shown_ns = at_ns
     expected = Verdict.VALID if at_ns < expires_ns else Verdict.EXPIRED
-    assert later.check(f"/api/v1/events/{one}/clips/best", query["expires"], query["signature"]) is expected
+    assert links.check(f"/api/v1/events/{one}/clips/best", query["expires"], query["signature"]) is expected
     if one != other:
-        found = later.check(f"/api/v1/events/{other}/clips/best", query["expires"], query["signature"])
+        found = links.check(f"/api/v1/events/{other}/clips/best", query["expires"], query["signature"])
         assert found is Verdict.INVALID
     stranger = SignedLinks(UnpacedClock(NOW_NS), None)
     found = stranger.check(f"/api/v1/events/{one}/clips/best", query["expires"], query["signature"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -12,18 +13,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from livessl.server.clips.folder import PARTIAL, ClipFolder, ClipsError
+from clip_desk import head, recordings
+from livessl.schema.clips import ClipFile
+from livessl.server.clips.folder import PARTIAL, ClipFolder
+from livessl.server.clips.reader import ClipsError, UnreadableClipError, parsed
 
 SOUND = b"what somebody said"
 real_rmtree = shutil.rmtree
 
 
 def write(start_ns: int, content: bytes = SOUND) -> Any:
-    def into(folder: Path) -> dict[str, Any]:
-        (folder / "a.flac").write_bytes(content)
-        return {"start_ns": start_ns, "files": [{"name": "a.flac", "bytes": len(content)}]}
-
-    return into
+    return recordings(start_ns, {"a.flac": content})
 
 
 def on_disk(path: Path) -> set[str]:
@@ -33,11 +33,11 @@ def on_disk(path: Path) -> set[str]:
 def test_clip_is_stored_read_kept_and_deleted(tmp_path: Path) -> None:
     folder = ClipFolder(tmp_path / "clips")
     folder.put("lab-1", write(5))
-    about = folder.about("lab-1")
-    assert about is not None
-    assert (about["start_ns"], about["keep"]) == (5, False)
+    clip = folder.read("lab-1")
+    assert clip is not None
+    assert (clip.start_ns, clip.keep) == (5, False)
     assert (tmp_path / "clips").stat().st_mode & 0o077 == 0
-    path = folder.file("lab-1", "a.flac")
+    path = clip.file("a.flac")
     assert path is not None
     assert path.read_bytes() == SOUND
     assert folder.keep("lab-1", True)
@@ -64,9 +64,10 @@ def test_names_that_are_no_recording_lead_nowhere(tmp_path: Path, name: str) -> 
     (tmp_path / "secret").write_text("secret", encoding="utf-8")
     folder = ClipFolder(tmp_path / "clips")
     folder.put("lab-1", write(5))
-    assert folder.file("lab-1", name) is None
-    assert folder.about(name) is None
-    assert folder.file(name, "a.flac") is None
+    clip = folder.read("lab-1")
+    assert clip is not None
+    assert clip.file(name) is None
+    assert folder.read(name) is None
     assert not folder.delete(name)
     with pytest.raises(ValueError, match="expected an event id"):
         folder.put("../x", write(5))
@@ -84,7 +85,7 @@ def test_error_while_writing_leaves_nothing_and_keeps_the_earlier_clip(tmp_path:
         with pytest.raises(OSError, match="No space"):
             folder.put(name, full)
     assert on_disk(tmp_path) == {"lab-1/a.flac", "lab-1/clip.json"}
-    assert folder.about("lab-2") is None
+    assert folder.read("lab-2") is None
 
 
 def test_clip_that_is_written_again_stays_kept(tmp_path: Path) -> None:
@@ -92,9 +93,9 @@ def test_clip_that_is_written_again_stays_kept(tmp_path: Path) -> None:
     folder.put("lab-1", write(5))
     folder.keep("lab-1", True)
     folder.put("lab-1", write(5, b"longer than before"))
-    about = folder.about("lab-1")
-    assert about is not None
-    assert about["keep"]
+    clip = folder.read("lab-1")
+    assert clip is not None
+    assert clip.keep
     assert folder.nbytes == len(b"longer than before")
 
 
@@ -119,17 +120,14 @@ def test_restart_finds_the_clips_and_deletes_what_is_unfinished(tmp_path: Path) 
     [{"files": ...}, {"files": None}, {"files": ["a"]}, {"files": [{"name": "a.txt", "bytes": 1}]}, {"start_ns": "x"},
      {"files": [{"name": "a.flac", "bytes": None}]}, {"keep": ...}, {"keep": "no"}, {"position_m": 3}],
 )  # fmt: skip
-def test_clip_that_another_program_has_changed_has_no_recordings(tmp_path: Path, changes: dict[str, Any]) -> None:
+def test_clip_that_another_program_has_changed_is_unreadable(tmp_path: Path, changes: dict[str, Any]) -> None:
     folder = ClipFolder(tmp_path)
     folder.put("lab-1", write(5))
     path = tmp_path / "lab-1" / "clip.json"
     about = {**json.loads(path.read_text()), **changes}
     path.write_text(json.dumps({name: value for name, value in about.items() if value is not ...}))
-    assert folder.complete("lab-1") is None
-    assert folder.file("lab-1", "a.flac") is None
-    assert not folder.keep("lab-1", True)
-    assert folder.delete("lab-1")
-    assert on_disk(tmp_path) == set()
+    with pytest.raises(UnreadableClipError, match=rf"got another one: .*{next(iter(changes))}"):
+        folder.read("lab-1")
 
 
 def broken(*names: str) -> Any:
@@ -149,25 +147,99 @@ def test_start_goes_on_after_folders_that_cannot_be_read_or_erased(
     folder = ClipFolder(tmp_path)
     folder.put("lab-9", write(5))
     (tmp_path / f"{PARTIAL}going-lab-1").mkdir()
-    for name, about in [("lab-2", b"{}"), ("lab-3", b'{"start_ns": null, "files": [], "keep": false}')]:
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "clip.json").write_bytes(about)
+    (tmp_path / "lab-2").mkdir()
     monkeypatch.setattr(shutil, "rmtree", broken(f"{PARTIAL}going-lab-1"))
     again = ClipFolder(tmp_path)
     again.load()
     assert again.count == 1
     assert "going-lab-1: cannot be read or deleted: Permission denied; correct its permissions or" in caplog.text
-    assert caplog.text.count("expected a complete clip.json") == 2
+    assert "lab-2: expected a clip with clip.json, got none; it is left alone" in caplog.text
 
 
-def test_start_deletes_clips_whose_file_about_them_is_empty_or_damaged(tmp_path: Path) -> None:
+UNREADABLE: dict[str, tuple[bytes, str]] = {
+    "empty": (b"", "it is empty"),
+    "cut short": (b'{"keep": tr', "it is not JSON"),
+    "no text": (b"\xff\xfe\x00", "it is not JSON"),
+    "not a number": (b'{"start_ns": NaN}', "it is not JSON"),
+    "a list": (b"[]", "input should be an object"),
+    "another object": (b"{}", "'start_ns' is missing"),
+}
+
+
+def damaged(folder: ClipFolder, path: Path, content: bytes) -> None:
+    folder.put("lab-1", write(5))
+    (path / "lab-1" / "clip.json").write_bytes(content)
+
+
+@pytest.mark.parametrize(("content", "why"), UNREADABLE.values(), ids=UNREADABLE)
+def test_unreadable_clip_is_told_from_none_counted_and_logged_once(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, content: bytes, why: str
+) -> None:
     folder = ClipFolder(tmp_path)
-    for name, about in [("lab-1", b""), ("lab-2", b'{"keep": tr'), ("lab-3", b"[]")]:
-        folder.put(name, write(5))
-        (tmp_path / name / "clip.json").write_bytes(about)
-    (tmp_path / "foreign").mkdir()
-    ClipFolder(tmp_path).load()
-    assert [each.name for each in tmp_path.iterdir()] == ["foreign"]
+    damaged(folder, tmp_path, content)
+    assert folder.unreadable == 0
+    for act in (folder.read, folder.read, lambda event_id: folder.keep(event_id, True)):
+        with pytest.raises(UnreadableClipError, match=f"event 'lab-1': expected a clip.json that .*: {why}.*or delete"):
+            act("lab-1")
+    assert caplog.text.count("server.clips.folder: event 'lab-1': expected a clip.json") == 1
+    assert (folder.unreadable, folder.has("lab-1"), folder.ids()) == (1, True, ["lab-1"])
+    assert folder.delete("lab-1")
+    assert (folder.unreadable, folder.read("lab-1"), on_disk(tmp_path)) == (0, None, set())
+
+
+def test_unreadable_clip_is_replaced_and_what_was_kept_stays_kept(tmp_path: Path) -> None:
+    folder = ClipFolder(tmp_path)
+    folder.put("lab-1", write(5))
+    folder.keep("lab-1", True)
+    (tmp_path / "lab-1" / "clip.json").write_bytes(b"")
+    with pytest.raises(UnreadableClipError):
+        folder.read("lab-1")
+    folder.put("lab-1", write(5))
+    clip = folder.read("lab-1")
+    assert clip is not None
+    assert (clip.keep, folder.unreadable) == (True, 0)
+
+
+@pytest.mark.parametrize("by_age", [True, False])
+def test_unreadable_clips_outlive_a_restart_and_are_deleted_by_age_and_size(tmp_path: Path, by_age: bool) -> None:
+    damaged(ClipFolder(tmp_path), tmp_path, b"{}")
+    os.utime(tmp_path / "lab-1" / "clip.json", ns=(7, 7))
+    again = ClipFolder(tmp_path)
+    again.load()
+    assert (again.count, again.unreadable, again.nbytes) == (1, 1, len(SOUND) + len(b"{}"))
+    limits = (7, again.nbytes), (8, again.nbytes) if by_age else (7, again.nbytes - 1)
+    assert [again.expire(*limit) for limit in limits] == [0, 1]
+    assert on_disk(tmp_path) == set()
+
+
+def test_clip_that_could_not_be_read_again_is_not_stored(tmp_path: Path) -> None:
+    folder = ClipFolder(tmp_path)
+    with pytest.raises(UnreadableClipError, match="'position_m' is missing"):
+        folder.put("lab-1", lambda _: {"start_ns": 5, "files": []})
+    assert on_disk(tmp_path) == set()
+
+
+VALUES = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
+    max_leaves=6,
+)
+
+
+@given(data=st.data())
+def test_no_content_of_the_file_about_a_clip_does_more_than_make_it_unreadable(data: st.DataObject) -> None:
+    about: dict[str, Any] = {**head(5, {"enhanced.flac": 7, "array-north.flac": 9}), "keep": False}
+    place = data.draw(st.sampled_from([about, about["files"][0]]))
+    place[data.draw(st.sampled_from(sorted(place)))] = data.draw(VALUES)
+    whole = json.dumps(about).encode()
+    content = data.draw(st.sampled_from([whole, whole[: data.draw(st.integers(0, len(whole)))]]) | st.binary())
+    with suppress(UnreadableClipError):
+        clip = parsed("lab-1", Path("lab-1"), content)
+        for file in clip.files:
+            ClipFile.model_validate(file)
+            assert file["name"].endswith((".flac", ".wav"))
+            assert "/" not in file["name"]
+        assert (type(clip.start_ns), type(clip.keep), type(clip.nbytes)) == (int, bool, int)
 
 
 def test_file_about_a_clip_is_on_the_disk_before_the_clip_has_its_name(
@@ -226,7 +298,7 @@ def test_clip_that_is_kept_while_old_ones_are_deleted_stays(tmp_path: Path, monk
     monkeypatch.setattr(folder, "_finish", kept_meanwhile)
     assert folder.expire(10, 1000) == 1
     assert (folder.count, folder.kept) == (1, 1)
-    assert folder.about("lab-2") is not None
+    assert folder.read("lab-2") is not None
 
 
 @given(
@@ -249,7 +321,7 @@ def test_expiry_deletes_old_ones_then_the_oldest_and_never_kept_ones(
         if sum(clips[each][0] for each in left) > most and start in left and not clips[start][1]:
             left.discard(start)
     gone = folder.expire(before, most)
-    assert {start for start in clips if folder.about(f"lab-{start}")} == left
+    assert {start for start in clips if folder.read(f"lab-{start}")} == left
     assert (gone, folder.count) == (len(clips) - len(left), len(left))
 
 
@@ -262,7 +334,7 @@ def test_clips_that_somebody_has_removed_do_not_count(tmp_path: Path) -> None:
         shutil.rmtree(tmp_path / name)
     assert folder.expire(None, 2 * len(SOUND)) == 0
     assert (folder.count, folder.nbytes, folder.kept_bytes) == (2, 2 * len(SOUND), 0)
-    assert folder.about("lab-2") is not None
+    assert folder.read("lab-2") is not None
 
 
 def test_folder_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:

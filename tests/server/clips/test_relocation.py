@@ -17,7 +17,7 @@ from livessl.core.types import FRAME_NS, Event, FloatArray, Frame, Status
 from livessl.recordings.assign import AssignedRecording
 from livessl.recordings.recording import MemoryRecording
 from livessl.server.clips import relocate as relocation
-from livessl.server.clips.folder import ClipReader
+from livessl.server.clips.reader import ClipReader
 from livessl.server.clips.relocate import relocate
 from livessl.server.clips.relocate_many import Task, relocate_many
 from livessl.server.clips.service import Clips
@@ -25,6 +25,7 @@ from livessl.server.clips.stored_sound import (
     NoClipError,
     RelocationError,
     check_memory,
+    stored_clip,
     stored_frames,
     stored_sound,
 )
@@ -184,9 +185,18 @@ INDEX = START_NS // FRAME_NS
 DAMAGES: dict[str, tuple[str, Any, str]] = {
     "field of another release": ("arrays.north.uncertainty.humidity_percent", 3.0, "humidity_percent"),
     "no speed of sound": ("c_m_s", ..., "'c_m_s' is missing"),
-    "speed of sound of zero": ("c_m_s", 0, "c_m_s: expected a number above 0, got 0"),
+    "speed of sound of zero": ("c_m_s", 0, "c_m_s: expected a number from 100 to 2000, got 0"),
+    "speed of sound that makes correlations fill the memory": ("c_m_s", 1e-9, "c_m_s: expected a number from 100"),
+    "microphones in another country": ("arrays.south.microphones_m", [[0, 0, 1], [1e9, 0, 1]], "expected positions"),
+    "sampling rate of nothing": (
+        "arrays.north.sample_rate_hz",
+        1e12,
+        r"expected a number from 100 to 1e\+06, got 1000000000000",
+    ),
+    "uncertainty in words": ("arrays.north.uncertainty.clock_s", "0.1", r"clock_s: expected a number from 0 to 100"),
+    "uncertainty below zero": ("arrays.north.uncertainty.position_m", -1, r"position_m: expected a number from 0"),
     "no list of files": ("files", ..., "'files' is missing"),
-    "files of another form": ("files", ["a.flac"], "string indices|indices must be"),
+    "files of another form": ("files", ["a.flac"], r"files\.0: input should be an object, got 'a\.flac'"),
     "no file of an array": ("files", [], "'north' is missing"),
     "short row": ("arrays.south.frames", [[1, 2, 3]], r"not enough values"),
     "begin before the recording": ("arrays.south.frames", [[1, -2, 3, 0.1, True, False]], "a begin of 0 or more"),
@@ -235,13 +245,13 @@ def test_sound_that_takes_too_much_memory_is_refused_before_it_is_read(
     copied: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder, event = ClipReader(copied), events()[0].id
-    frames = [frame for array in stored_sound(folder, event).arrays for frame in stored_frames(folder, event, array)]
+    sound = stored_sound(stored_clip(folder, event))
+    frames = [frame for array in sound.arrays for frame in stored_frames(sound, array)]
     nbytes = sum(frame.samples.nbytes for frame in frames)
-    about = folder.about(event)
-    assert about is not None
-    whole = sum(4 * each["channels"] * round(each["sample_rate_hz"] * each["duration_s"]) for each in about["files"])
+    files = sound.clip.files
+    whole = sum(4 * each["channels"] * round(each["sample_rate_hz"] * each["duration_s"]) for each in files)
     assert 0.5 * whole < nbytes <= whole
-    check_memory(stored_sound(folder, event), whole)
+    check_memory(sound, whole)
     read: list[Any] = []
     monkeypatch.setattr(relocation, "stored_frames", lambda *wanted: read.append(wanted))
     with pytest.raises(

@@ -5,71 +5,27 @@ from __future__ import annotations
 import threading
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
 
 from alert_desk import START, refused, sound
-from livessl.core.stream.clock_offsets import ClockOffsets
-from livessl.core.stream.load_policy import LEVELS, NOTHING_SHED
+from clip_desk import ClipDesk, head
+from livessl.core.stream.load_policy import LEVELS
 from livessl.core.types import FRAME_NS, Event, Frame, Status
 from livessl.server.clips import service
 from livessl.server.clips.record import write_clip
-from livessl.server.clips.service import SETTLE_NS, Clips
-from small_site import RATE_HZ, Changes, frame, site_of
+from livessl.server.clips.service import SETTLE_NS
+from small_site import RATE_HZ, Changes, frame
 
 DAY_NS = 86_400_000_000_000
 CLIPS: dict[str, Any] = {"folder": "clips", "pre_s": 1.0, "post_s": 0.5}
 
 
-class HandClock:
-    """A clock that a test sets; it begins when the sounds do."""
-
-    def __init__(self) -> None:
-        self.ns = START * FRAME_NS
-
-    def now_ns(self) -> int:
-        return self.ns
-
-    monotonic_ns = now_ns
-
-    def sleep_until_ns(self, time_ns: int) -> bool:
-        self.ns = max(self.ns, time_ns)
-        return True
-
-
-class Switches:
-    """Stands in for site time and overload."""
-
-    is_replay = False
-    relief = NOTHING_SHED
-
-
-class Desk:
-    """Clips without a server: a test hands in frames and events, and moves the clock."""
-
-    def __init__(self, directory: Path, changes: Changes | None = None, **clips: Any) -> None:
-        site = site_of({"server.clips": CLIPS | clips, **(changes or {})}, directory)
-        assert site.server.clips is not None
-        self.clock, self.switches = HandClock(), Switches()
-        switches = cast(Any, self.switches)
-        self.clips = Clips(site, site.server.clips, self.clock, switches, switches)
-        self.offsets = ClockOffsets({"north": "a", "south": "b"}, site.c_m_s)
-
-    def finish(self, *events: Event) -> None:
-        for event in events:
-            self.clips.take_final(event, self.offsets)
-
-    def work(self) -> None:
-        """Let the time come at which everything that waits is due, and do it."""
-        self.clock.ns += 10_000_000_000
-        while self.clips.work():
-            pass
-
-    def files(self, event: Event) -> dict[str, dict[str, Any]]:
-        about = self.clips.folder.about(event.id)
-        return {} if about is None else {file["name"]: file for file in about["files"]}
+def desk_of(directory: Path, changes: Changes | None = None, **clips: Any) -> ClipDesk:
+    """A desk whose clock begins when the sounds do."""
+    return ClipDesk(directory, START * FRAME_NS, changes, **clips)
 
 
 def heard(indices: Sequence[int], array: str = "north", ahead_ns: int = 0) -> list[Frame]:
@@ -99,7 +55,7 @@ def event(number: int = 0, **more: Any) -> Event:
 
 
 def test_clip_has_the_whole_span_that_was_sent_and_says_how_much_that_is(tmp_path: Path) -> None:
-    desk = Desk(tmp_path)
+    desk = desk_of(tmp_path)
     desk.clips.take([*heard(range(-60, 30)), *heard(range(-8, 16), "south")], None)
     desk.finish(event())
     assert desk.clips.is_waiting("small-0")
@@ -114,7 +70,7 @@ def test_clip_has_the_whole_span_that_was_sent_and_says_how_much_that_is(tmp_pat
 
 
 def test_frames_that_are_missing_are_listed_and_counted(tmp_path: Path) -> None:
-    desk = Desk(tmp_path)
+    desk = desk_of(tmp_path)
     desk.clips.take([*heard([*range(-8, 3), *range(6, 16)]), *heard(range(-8, 16), "south")], None)
     desk.finish(event())
     desk.work()
@@ -123,7 +79,7 @@ def test_frames_that_are_missing_are_listed_and_counted(tmp_path: Path) -> None:
 
 
 def test_gap_before_the_event_makes_no_clip_incomplete(tmp_path: Path) -> None:
-    desk = Desk(tmp_path)
+    desk = desk_of(tmp_path)
     desk.clips.take([*heard([*range(-18, -12), *range(-8, 16)]), *heard(range(-8, 16), "south")], None)
     desk.finish(event())
     desk.work()
@@ -132,7 +88,7 @@ def test_gap_before_the_event_makes_no_clip_incomplete(tmp_path: Path) -> None:
 
 
 def test_array_whose_clock_is_known_to_be_ahead_is_cut_at_the_time_of_the_sound(tmp_path: Path) -> None:
-    desk, ahead_ns = Desk(tmp_path, pre_s=0.2, post_s=0.0), 110_000_000
+    desk, ahead_ns = desk_of(tmp_path, pre_s=0.2, post_s=0.0), 110_000_000
     for n in range(4):
         desk.offsets.learn(START * FRAME_NS + n, {"north": 0.0, "south": ahead_ns / 1e9})
     rest_s = desk.offsets.rest_s("south") + 0.05 * desk.offsets.frames_ahead("south")
@@ -150,14 +106,14 @@ def test_array_whose_clock_is_known_to_be_ahead_is_cut_at_the_time_of_the_sound(
     "other", [refused(0), sound(0, status=Status.DIRECTION_ONLY)], ids=["refused", "direction only"]
 )
 def test_event_without_a_position_gets_no_clip(tmp_path: Path, other: Event) -> None:
-    desk = Desk(tmp_path)
+    desk = desk_of(tmp_path)
     desk.clips.take(heard(range(-8, 16)), None)
     desk.finish(other)
     assert desk.clips.waiting == 0
 
 
 def test_replay_gives_neither_frames_nor_events(tmp_path: Path) -> None:
-    desk = Desk(tmp_path)
+    desk = desk_of(tmp_path)
     desk.switches.is_replay = True
     desk.clips.take(heard(range(-8, 16)), None)
     desk.finish(event())
@@ -169,7 +125,7 @@ def test_replay_gives_neither_frames_nor_events(tmp_path: Path) -> None:
 
 
 def test_server_that_gives_up_arrays_cuts_no_clips_and_counts_them(tmp_path: Path) -> None:
-    desk = Desk(tmp_path)
+    desk = desk_of(tmp_path)
     desk.clips.take(heard(range(-8, 16)), None)
     desk.switches.relief = LEVELS[1]  # updates are given up, and clips are still cut
     desk.finish(event(1))
@@ -182,7 +138,7 @@ def test_server_that_gives_up_arrays_cuts_no_clips_and_counts_them(tmp_path: Pat
 
 
 def test_clip_is_not_cut_before_its_last_frames_can_have_come(tmp_path: Path) -> None:
-    desk = Desk(tmp_path)
+    desk = desk_of(tmp_path)
     desk.clips.take(heard(range(-8, 12)), None)
     desk.clock.ns = event().end_ns
     desk.finish(event())
@@ -195,7 +151,7 @@ def test_clip_is_not_cut_before_its_last_frames_can_have_come(tmp_path: Path) ->
 
 
 def test_frames_are_released_once_their_results_are_final(tmp_path: Path) -> None:
-    desk = Desk(tmp_path)
+    desk = desk_of(tmp_path)
     desk.clips.take(heard(range(20)), None)
     desk.clips.take([], START + 100)
     desk.finish(event())
@@ -205,7 +161,7 @@ def test_frames_are_released_once_their_results_are_final(tmp_path: Path) -> Non
 
 
 def test_frames_of_the_longest_event_are_kept_until_its_clip_is_cut(tmp_path: Path) -> None:
-    desk = Desk(tmp_path, {"fusion.max_event_s": 60})
+    desk = desk_of(tmp_path, {"fusion.max_event_s": 60})
     desk.clips.take(heard(range(-8, 16)), None)
     desk.clips.take([], START + 1200)  # one minute of an event is final at once
     desk.finish(event())
@@ -214,7 +170,7 @@ def test_frames_of_the_longest_event_are_kept_until_its_clip_is_cut(tmp_path: Pa
 
 
 def test_clips_that_were_deleted_and_not_erased_are_erased_with_the_next_old_ones(tmp_path: Path) -> None:
-    desk = Desk(tmp_path)
+    desk = desk_of(tmp_path)
     left = tmp_path / "clips" / ".partial-going-small-1"
     left.mkdir()
     (left / "a.flac").write_bytes(b"sound")
@@ -225,7 +181,7 @@ def test_clips_that_were_deleted_and_not_erased_are_erased_with_the_next_old_one
 def test_clip_that_fails_for_whatever_reason_is_counted_and_the_next_one_is_made(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    desk = Desk(tmp_path)
+    desk = desk_of(tmp_path)
 
     def fail(*_: Any) -> Any:
         raise np.linalg.LinAlgError("Singular matrix")
@@ -246,7 +202,7 @@ def test_clip_that_fails_for_whatever_reason_is_counted_and_the_next_one_is_made
 def test_disk_that_hangs_delays_nobody_and_what_does_not_fit_is_counted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    desk, reached, release = Desk(tmp_path), threading.Event(), threading.Event()
+    desk, reached, release = desk_of(tmp_path), threading.Event(), threading.Event()
 
     def slow(*arguments: Any) -> Any:
         reached.set()
@@ -276,7 +232,7 @@ def test_disk_that_hangs_delays_nobody_and_what_does_not_fit_is_counted(
 def test_clips_are_deleted_at_their_age_or_with_their_event(
     tmp_path: Path, changes: Changes, clips: dict[str, Any], days: int
 ) -> None:
-    desk = Desk(tmp_path, changes, **clips)
+    desk = desk_of(tmp_path, changes, **clips)
     desk.clips.take(heard(range(-8, 16)), None)
     desk.finish(event())
     desk.work()
@@ -289,14 +245,14 @@ def test_clips_are_deleted_at_their_age_or_with_their_event(
 
 
 def test_clips_kept_for_ever_that_leave_no_room_are_a_problem(tmp_path: Path) -> None:
-    desk = Desk(tmp_path, max_bytes=1_000_000)
+    desk = desk_of(tmp_path, max_bytes=1_000_000)
     for number in range(2):
         desk.clips.take(heard(range(-8 + 20 * number, 16 + 20 * number)), None)
         desk.finish(event(number))
         desk.work()
         desk.clips.folder.keep(f"small-{number}", True)
     assert desk.clips.problems == []
-    desk.clips.folder.put("small-0", lambda folder: {"start_ns": 0, "files": [{"name": "a", "bytes": 1_200_000}]})
+    desk.clips.folder.put("small-0", lambda _: head(0, {"a.flac": 1_200_000}))
     [problem] = desk.clips.problems
     assert problem.startswith("server.clips.max_bytes: clips that are kept for ever take 1.")
     assert problem.endswith(" MB of 1.0 MB, so that new ones are deleted; keep fewer, or raise it")
@@ -305,7 +261,7 @@ def test_clips_kept_for_ever_that_leave_no_room_are_a_problem(tmp_path: Path) ->
 
 
 def test_enhanced_signal_can_be_left_out(tmp_path: Path) -> None:
-    desk = Desk(tmp_path, enhanced=False)
+    desk = desk_of(tmp_path, enhanced=False)
     desk.clips.take(heard(range(-8, 16)), None)
     desk.finish(event())
     desk.work()
@@ -314,7 +270,7 @@ def test_enhanced_signal_can_be_left_out(tmp_path: Path) -> None:
 
 def test_array_of_more_than_eight_microphones_is_stored_as_wav(tmp_path: Path) -> None:
     circle = {"geometry": {"circle": {"radius_m": 0.2, "count": 9}}, "position_m": [1.9, 1.3, 1.4]}
-    desk = Desk(tmp_path, {"arrays.north": circle, "nodes": {}})
+    desk = desk_of(tmp_path, {"arrays.north": circle, "nodes": {}})
     wide = [
         Frame("north", 1, f.frame_index, f.time_ns, RATE_HZ, np.tile(f.samples, (3, 1))[:9], 0.01, f.active)
         for f in heard(range(-8, 16))

@@ -8,6 +8,12 @@ from typing import Final
 CURE: Final = "clap at places that you know, and run livessl calibrate verify"
 """What shows a fault that sounds at unknown places hide."""
 
+MOST_SHIFT_M: Final = 1000.0
+"""Least shift, in metres, from which on no shift would show, so that no size is told."""
+
+MOST_TURN_DEG: Final = 180.0
+"""The same of turns, in degrees."""
+
 
 @dataclass(frozen=True, slots=True)
 class BlindSpot:
@@ -35,7 +41,10 @@ class BlindSpot:
         """What the sounds cannot show, in one sentence without a full stop."""
         names = " or ".join(repr(name) for name in self.arrays)
         along = ", ".join(f"{x:.2f}" for x in self.along)
-        how = f"moved by less than {self.least:.1f} m along ({along})"
         if self.fault == "turned":
-            how = f"turned by less than {self.least:.0f} degrees about ({along})"
+            size = f" by less than {self.least:.0f} degrees" if self.least < MOST_TURN_DEG else ""
+            how = f"turned{size} about ({along})"
+        else:
+            size = f" by less than {self.least:.1f} m" if self.least < MOST_SHIFT_M else ""
+            how = f"moved{size} along ({along})"
         return f"these sounds cannot show whether {names} is {how}"

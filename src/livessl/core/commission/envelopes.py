@@ -15,6 +15,10 @@ from livessl.core.types import Float32Array, FloatArray
 HOP_S: Final = 0.01
 """Length, in seconds, of the pieces whose power is measured."""
 
+MOST_GAP_S: Final = 3600.0
+"""Longest gap, in seconds, after which a recording is still measured: a clock that was set, such as that of a machine
+that starts in 1970, leaves a gap of decades, and each piece of it would take memory."""
+
 _DECAY_DB_S: Final = 40.0
 """Decay of reverberation, in dB a second; power that stays below such a decay from earlier power is no rise."""
 
@@ -29,7 +33,7 @@ _LEAST_POWER: Final = 2.0**-30 / 12.0
 
 
 class EnvelopeMeter:
-    """Measures the power of one array's recording in pieces of `HOP_S`.
+    """Measures the power of one array's recording in pieces of `HOP_S`, up to the first gap longer than `MOST_GAP_S`.
 
     Parameters
     ----------
@@ -41,10 +45,14 @@ class EnvelopeMeter:
         self._pieces: list[Float32Array] = []
         self._count = 0  # of the pieces so far
         self._waiting: list[Float32Array] = []
+        self._is_over = False
         self._at = self._next = 0  # indices of the first sample that waits, and of the one that comes next
 
     def push(self, index: int, samples: Float32Array) -> None:
         """Take in samples (K, n), of which the first has this index; indices that are left out are a gap."""
+        self._is_over = self._is_over or index - self._next > MOST_GAP_S * self._rate_hz
+        if self._is_over:
+            return
         if index != self._next:
             self._measure()
             self._skip_to(index)

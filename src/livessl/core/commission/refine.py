@@ -7,8 +7,9 @@ places do not show where in the room the whole set-up is, so one array at least 
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import replace
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -107,14 +108,7 @@ def refine(
     exact = replace(freedom, microphone_std_m=MICROPHONE_STD_M)
     last = _adjusted(start, kept, search, exact, std_s)
     if times is not None:
-        # poses that fit all times between arrays, but not the delays within them, are another lowest point far away
-        with_times = _adjusted(start, kept, search, exact, std_s, times, last)
-        off_s = times.contradictions_s(with_times.microphones, with_times.places_m, with_times.c_m_s)
-        if _rms(off_s) > times.std_s:  # an array received some sounds by an echo
-            times = replace(times, std_s=_rms(off_s))
-            with_times = _adjusted(start, kept, search, exact, std_s, times, with_times)
-        if _rms(with_times.misfits_s) <= max(CONTRADICTION * _rms(last.misfits_s), LEAST_STD_S):
-            last = with_times
+        last = _with_times(times, last, partial(_adjusted, start, kept, search, exact, std_s))
     placed = {name: last.microphones[name] if name in free else at_m for name, at_m in start.items()}
     before_s = search.fit(microphones, kept).misfit_s
     after_s = PlaceSearch(bounds_m, last.c_m_s).fit(placed, kept).misfit_s
@@ -139,6 +133,25 @@ def _adjusted(
     return adjust(
         start, delays, places_m, search.c_m_s, freedom, delay_std_s=delay_std_s, arrivals=arrivals, begin=begin
     )
+
+
+def _with_times(times: Arrivals, without: Adjusted, adjusted: Callable[[Arrivals, Adjusted], Adjusted]) -> Adjusted:
+    """Return the set-up that fits the times between arrays as well, or `without` them if they contradict it.
+
+    Parameters
+    ----------
+    times : Arrivals
+    without : Adjusted
+        The set-up that fits the delays within the arrays.
+    adjusted : callable
+        Fits a set-up to the delays and to times between arrays, beginning with a set-up.
+    """
+    found = adjusted(times, without)
+    off_s = times.contradictions_s(found.microphones, found.places_m, found.c_m_s)
+    if _rms(off_s) > times.std_s:  # an array received some sounds by an echo
+        found = adjusted(replace(times, std_s=_rms(off_s)), found)
+    # poses that fit all times between arrays, but not the delays within them, are another lowest point far away
+    return found if _rms(found.misfits_s) <= max(CONTRADICTION * _rms(without.misfits_s), LEAST_STD_S) else without
 
 
 def _rms(misfits_s: FloatArray) -> float:

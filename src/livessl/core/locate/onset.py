@@ -12,6 +12,7 @@ from livessl.core.correlate.gcc_phat import LagSampling, require_band
 from livessl.core.correlate.onset_gcc import OnsetFrontEnd, OnsetGCC, has_long_windows, summed
 from livessl.core.geometry import Grid, microphone_pairs
 from livessl.core.locate import ambiguity, outliers
+from livessl.core.locate.background import background_lags, loud_frames
 from livessl.core.locate.beginning import beginning, first_frame
 from livessl.core.locate.confidence import (
     CROSSING_DEG,
@@ -22,7 +23,7 @@ from livessl.core.locate.confidence import (
 )
 from livessl.core.locate.contributing import FAINT, NO_EVIDENCE, contributing
 from livessl.core.locate.estimator import Localization, Sound, strongest_onsets
-from livessl.core.locate.frame_gccs import BEGINNING, FrameGCCs
+from livessl.core.locate.frame_gccs import FrameGCCs
 from livessl.core.locate.map_estimator import MapEstimator, map_grid
 from livessl.core.locate.outliers import Consensus
 from livessl.core.locate.outside import Outside, find_outside
@@ -57,12 +58,6 @@ place of the beginning is looked for: 15 % of the right positions of the develop
 
 LEAD: Final = 1.0
 """Peak-to-RMS ratio by which the beginning must be clearer at its own place than at another one to be preferred."""
-
-
-FAR_BELOW: Final = 0.05
-COMPARABLE: Final = 0.1
-"""Power of a background relative to that of the sound, 13 and 10 dB below, from which on it counts, and counts in full.
-What a room still gives of an earlier sound from the same place is usually weaker."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,13 +134,12 @@ class Onset(MapEstimator):
         looks_at_whole = looks_again and all(sound.ended for sound in strongest.values())
         evidence = self.evidence(strongest)
         suspect = [name for name, sound in strongest.items() if sound.suspect]
-        answer = self._answer(evidence, suspect, tolerance=looks_again)
-        if answer.judgement.features.background >= BACKGROUND:
-            beneath = self._without_background(evidence, answer.consensus.place)
-            other = self._answer(beneath, suspect, tolerance=looks_again)
-            if other.refused is None and other.rank() > answer.rank():
-                evidence, answer = beneath, other
-        answer = self._by_beginning(answer, suspect)
+        evidence, answer = self._beneath_background(evidence, suspect, tolerance=looks_again)
+        if looks_again and not answer.is_sure:
+            loud = self._loud(evidence, strongest)
+            if loud is not None:
+                _, by_loud = self._beneath_background(loud, suspect, tolerance=True)
+                answer = max(answer, by_loud, key=_Answer.rank)
         outside = self._outside(answer)
         separation = None
         if outside is None or not outside.is_sufficient:
@@ -168,6 +162,21 @@ class Onset(MapEstimator):
         power = None if separation is None else separation.power
         return replace(found, unneeded=sounds.keys() - answer.contributing, others=others, power=power)
 
+    def _beneath_background(
+        self, evidence: tuple[Evidence, ...], suspect: Collection[str], *, tolerance: bool
+    ) -> tuple[tuple[Evidence, ...], _Answer]:
+        """Answer by evidence; if the background explains the place, by what remains without it. Return what was used.
+
+        Where the sound did not begin at that place, the place of its beginning is the answer.
+        """
+        answer = self._answer(evidence, suspect, tolerance=tolerance)
+        if answer.judgement.features.background >= BACKGROUND:
+            beneath = self._without_background(evidence, answer.consensus.place)
+            other = self._answer(beneath, suspect, tolerance=tolerance)
+            if other.refused is None and other.rank() > answer.rank():
+                evidence, answer = beneath, other
+        return evidence, self._by_beginning(answer, suspect)
+
     def _by_beginning(self, answer: _Answer, suspect: Collection[str]) -> _Answer:
         """Return the place from which a sound began, if that is clear and an answer is elsewhere.
 
@@ -181,6 +190,22 @@ class Onset(MapEstimator):
         apart_m = np.linalg.norm(other.consensus.place.position_m - answer.consensus.place.position_m)
         lead = other.judgement.features.peak_to_rms - features.beginning
         return other if other.refused is None and apart_m > NEAR_M and lead > LEAD else answer
+
+    def _loud(self, evidence: Sequence[Evidence], sounds: Mapping[str, Sound]) -> tuple[Evidence, ...] | None:
+        """Return the evidence of loud frames alone, where a background is known; None if that is the same."""
+        loud = {part.spec.name: loud_frames(sounds[part.spec.name]) for part in evidence}
+        if not any(loud.values()):
+            return None
+
+        def of_loud(part: Evidence) -> Evidence:
+            name = part.spec.name
+            if not loud[name]:
+                return part
+            sound, onsets = sounds[name], summed([sounds[name].onsets[k] for k in loud[name]])
+            own = self._evidence_of(name, sound, onsets, background_lags(sound, len(loud[name])))
+            return replace(own, beginning=part.beginning)
+
+        return tuple(of_loud(part) for part in evidence)
 
     def evidence(self, sounds: Mapping[str, Sound]) -> tuple[Evidence, ...]:
         """Sum each array's onset GCCs; the evidence is in the order of the arrays' names."""
@@ -315,13 +340,13 @@ class Onset(MapEstimator):
         if not sound.onsets:
             onsets = self.onset_front_end(array, sound.sample_rate_hz).push_segments(sound.segments)
             return self._evidence_of(array, sound, onsets, None)
-        evidence = self._evidence_of(array, sound, summed(sound.onsets), _background(sound))
+        evidence = self._evidence_of(array, sound, summed(sound.onsets), background_lags(sound))
         is_wide = has_long_windows(self.arrays[array].aperture_m / self.c_m_s)  # as long as a beginning
         begun = None if is_wide else beginning(sound, first)
         if begun is None:
             return evidence
         parts = sound.onsets[begun]
-        own = self._evidence_of(array, sound, summed(parts), _background(sound, len(parts)))
+        own = self._evidence_of(array, sound, summed(parts), background_lags(sound, len(parts)))
         return replace(evidence, beginning=own)
 
     def _evidence_of(self, array: str, sound: Sound, onsets: OnsetGCC, background: Float32Array | None) -> Evidence:
@@ -347,30 +372,6 @@ class Onset(MapEstimator):
         self._samplings[array] = (sample_rate_hz, sampling)
         self._search.prepare(array, sampling.fine_lags_s)
         return sampling
-
-
-def _background(sound: Sound, frames: int | None = None) -> Float32Array | None:
-    """Lags that frames of a sound would add up to if its background had gone on alone; None if it is not known.
-
-    `frames` is their number; None for all from the beginning of the sound on.
-
-    The background is known from the pre-roll without its last frames, in which the sound may begin. The weights of
-    onsets say little about power, so that a background `FAR_BELOW` the sound is left out. Envelopes are magnitudes:
-    those of noise do not cancel, and say nothing about a place.
-    """
-    course = sound.course
-    if course is None or not sound.onsets:
-        return None
-    before = int(np.searchsorted(course.frame_indices, course.begin - BEGINNING))
-    known = [k for k in range(before) if sound.onsets[k].weight > 0.0]  # not those in which the noise was learned
-    if not known or before == len(sound.onsets) or np.iscomplexobj(sound.onsets[0].lags):
-        return None
-    level = float(course.powers[known].mean()) / max(float(course.powers[before:].mean()), 1e-30)
-    counted = min(1.0, (level - FAR_BELOW) / (COMPARABLE - FAR_BELOW))
-    if counted <= 0.0:
-        return None
-    share = counted * (frames or len(sound.onsets) - before) / len(known)
-    return np.float32(share) * np.asarray(summed([sound.onsets[k] for k in known]).lags, dtype=np.float32)
 
 
 def _names(evidence: Sequence[Evidence]) -> frozenset[str]:

@@ -2,7 +2,7 @@
 
 A frame index closes when every array that is awaited has reached it, or at its deadline. An active frame that comes
 later is kept and counted as late. Early results that were already computed do not include it; the final pass
-(`final_pass`) does. An array is awaited while it sends, keeps up, and is not excluded.
+(`final_input`) does. An array is awaited while it sends, keeps up, and is not excluded.
 """
 
 from __future__ import annotations

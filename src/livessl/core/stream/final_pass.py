@@ -9,18 +9,18 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import reduce
 from typing import Final
 
 from livessl.core.locate.estimator import PowerMaps
-from livessl.core.stream.alignment import is_ahead_of_clock, is_too_old
+from livessl.core.stream.alignment import is_ahead_of_clock
 from livessl.core.stream.array_health import ArrayStatus, NodeReport
+from livessl.core.stream.final_input import FinalInput
 from livessl.core.stream.fusion import Fusion, Role
-from livessl.core.stream.held_frames import HOLD_BYTES, HOLD_NS, HeldFrames
+from livessl.core.stream.held_frames import HOLD_BYTES, HOLD_NS
 from livessl.core.stream.load_policy import Relief
-from livessl.core.stream.reception import FinalReception, earlier, later
 from livessl.core.stream.site_state import ArraySetUp, SiteState
-from livessl.core.types import FRAME_NS, BackfillRequest, Event, Frame, Mark, Message, Output, Window
+from livessl.core.stream.update_schedule import UpdateSchedule
+from livessl.core.types import FRAME_NS, BackfillRequest, Event, Frame, Message, Output, Window
 
 STRIDE: Final = 40
 """Number of frame indices that the final pass closes at a time: two seconds. After a stride with events, the early pass
@@ -66,18 +66,13 @@ class TwoPassFusion:
         hold_bytes: int = HOLD_BYTES,
     ) -> None:
         self._state, self._final_state = state, state.for_another_pass()
-        self._limits = hold_ns, hold_bytes
         self._early = Fusion(state, Role(newest_only=newest_only, learns_clocks=False))
-        self._receptions = {name: FinalReception() for name in arrays}
-        self.duplicates = dict.fromkeys(self._receptions, 0)
-        """Number of frames of each array that had come before."""
-        self.backlog_frames = dict.fromkeys(self._receptions, 0)
-        """Number of frames of each array that came as backlog."""
-        self.too_late = dict.fromkeys(self._receptions, 0)
-        """Number of new frames of each array that came after the results of their time were final."""
-        self.asked = dict.fromkeys(self._receptions, 0)
+        self._arrays = tuple(arrays)
+        self.input = FinalInput(state, self._arrays, self._ahead, hold_ns=hold_ns, hold_bytes=hold_bytes)
+        """Frames that have come for the final pass."""
+        self.asked = dict.fromkeys(self._arrays, 0)
         """Number of backfill requests to each array."""
-        self.helped = dict.fromkeys(self._receptions, 0)
+        self.helped = dict.fromkeys(self._arrays, 0)
         """Number of events with requested frames of each array."""
         self._begin(settled)
 
@@ -90,17 +85,12 @@ class TwoPassFusion:
     def settled_of(self) -> dict[str, int]:
         """The frame index `settled` for each array, as the array's node counts by its own clock."""
         settled = self.settled
-        return {} if settled is None else {name: settled + self._ahead(name) for name in self._receptions}
+        return {} if settled is None else {name: settled + self._ahead(name) for name in self._arrays}
 
     @property
-    def updates_left_out(self) -> int:
-        """Number of windows that were not located, because newer ones were due."""
-        return self._early.updates_left_out
-
-    @property
-    def updates_shed(self) -> int:
-        """Number of windows that were not located, because the server was overloaded."""
-        return self._early.updates_shed
+    def updates(self) -> UpdateSchedule:
+        """Decides which windows are located while a sound goes on."""
+        return self._early.updates
 
     @property
     def located(self) -> frozenset[str] | None:
@@ -120,11 +110,6 @@ class TwoPassFusion:
         for state in (self._state, self._final_state):
             state.follow(set_up, None if closed is None else closed + 1)
         self._state.votes.clear()
-
-    @property
-    def held_bytes(self) -> int:
-        """Memory of the samples that wait for the final pass, in bytes."""
-        return self._held.nbytes
 
     def prepare(self, array: str, sample_rate_hz: float) -> None:
         """Compute what an array's sound will need, so that its first event does not wait for it."""
@@ -152,18 +137,15 @@ class TwoPassFusion:
         answers : bool
             Whether the node answers backfill requests.
         """
-        reception = self._receptions.get(array)
-        if reception is None:
-            return
-        self._state.set_answers(array, answers)
-        reception.greet(backlog, now_ns)
+        if array in self._arrays:
+            self._state.set_answers(array, answers)
+            self.input.greet(array, backlog, now_ns)
 
     def leave(self, array: str) -> None:
         """Stop waiting for an array whose node has ended on purpose."""
         self._early.leave(array)
         self._state.set_answers(array, False)
-        if array in self._receptions:
-            self._receptions[array].leave()
+        self.input.leave(array)
 
     def exclude(self, arrays: Collection[str]) -> None:
         """Exclude these arrays from now on, and include all others again: see `SiteState.exclude`."""
@@ -175,14 +157,15 @@ class TwoPassFusion:
         if settled is not None and is_ahead_of_clock(settled, now_ns):
             self._begin(None)  # the server's clock was set back: final results lie in the future now
             self._early.skip_events(None, None)
+        settled, closed = self.settled, self._early.closed
         live: list[Message] = []
         requested: list[Message] = []
         for message in map(self._state.without_excluded, messages):
             if isinstance(message, Frame) and message.requested:
                 requested.append(message)
-            elif self._take(message, now_ns):
+            elif self.input.take(message, now_ns, settled=settled, closed_early=closed):
                 live.append(message)
-        frontier = self._frontier(now_ns)
+        frontier = self.input.complete_until(now_ns, self._position)
         final = self._settle(frontier, now_ns, requested)
         self._early.skip_events(self.settled, frontier)
         outputs = [*self._early.step(live + requested, now_ns), *final]
@@ -193,7 +176,7 @@ class TwoPassFusion:
 
     def flush(self, now_ns: int) -> list[Output | FinalResults]:
         """Report everything without waiting for any array, at the end of a recording."""
-        end = self._end()
+        end = self.input.end
         self._state.stop_answers()
         self._early.skip_events(end, end)
         outputs: list[Output | FinalResults] = [*self._early.flush(now_ns)]
@@ -208,98 +191,42 @@ class TwoPassFusion:
             self._final.begin(settled)
         self._settled = settled
         self._position: int | None = None  # frame index up to which the final pass has gone
-        self._newest: int | None = None  # the newest frame index that has come of any array
-        self._held = HeldFrames(*self._limits)
-        self._late: set[int] = set()  # active frame indices that the early pass could not use in time
-        self._forgotten_before: int | None = None
-        for reception in self._receptions.values():
-            reception.start_over()
+        self.input.start_over()
 
-    # --- what comes in
-
-    def _take(self, message: Message, now_ns: int) -> bool:
-        """Take in a message for the final pass; return whether the early pass takes it as well."""
-        reception = self._receptions.get(message.array)
-        if reception is None:
-            return True
-        own = message.frame_index
-        frame_index, is_backlog = own - self._ahead(message.array), reception.is_backlog(own)
-        if is_ahead_of_clock(frame_index, now_ns) or (not is_backlog and is_too_old(frame_index, now_ns)):
-            return True  # the early pass rejects it, and notes why
-        reception.touch(now_ns)
-        self._newest = frame_index if self._newest is None else max(self._newest, frame_index)
-        if isinstance(message, Mark):
-            reception.take_mark(own)
-            return True
-        if is_backlog:
-            reception.take_backlog(own)
-        settled = self.settled
-        if own in reception.seen or (settled is not None and frame_index < settled):
-            (self.too_late if reception.is_new(own) else self.duplicates)[message.array] += 1
-            return False
-        reception.add(own)
-        self._held.push(message, frame_index, now_ns)
-        self.backlog_frames[message.array] += is_backlog
-        closed = self._early.closed
-        is_in_time = not is_backlog or now_ns - frame_index * FRAME_NS < self._state.parameters.deadline_s * 1e9
-        if message.active and (not is_in_time or (closed is not None and frame_index <= closed)):
-            self._late.add(frame_index)
-        return is_in_time
+    # --- the final pass
 
     def _ahead(self, array: str) -> int:
         """Return by how many frames an array's own frame indices are ahead of the joint ones."""
         return self._final.frames_ahead(array)
 
-    def _frontier(self, now_ns: int) -> int | None:
-        """Return the frame index up to which all awaited arrays have sent everything; None if one has sent nothing.
-
-        Arrays that are away are awaited until the frames of the others are overdue.
-        """
-        self._held.expire(now_ns, self._position, shedding=self._state.relief.arrays is not None)
-        connected: list[int | None] = []
-        away: list[int | None] = []
-        for name, reception in self._receptions.items():
-            if not (reception.has_left or self._state.is_excluded(name)):
-                known = reception.known_until
-                known = None if known is None else known - self._ahead(name)
-                (connected if reception.is_connected(now_ns) else away).append(known)
-        if away:
-            connected.append(later(reduce(earlier, away), self._held.overdue_until))
-        return later(reduce(earlier, connected) if connected else self._end(), self._held.forced_until)
-
-    def _end(self) -> int | None:
-        """Return the frame index at which all sound so far has certainly ended; None before the first message."""
-        return None if self._newest is None else self._newest + self._state.parameters.activity.hang_over_frames + 1
-
-    # --- the final pass
-
     def _settle(
         self, frontier: int | None, now_ns: int, requested: Sequence[Message] = ()
     ) -> list[FinalResults | BackfillRequest]:
-        if self._newest is None or frontier is None:
+        if frontier is None or self.input.end is None:
             return []
         if self._position is None:
-            first = self._held.first
+            first = self.input.held.first
             self._position = (frontier if first is None else min(first, frontier)) - 1
         outputs = self._final.step(requested, (self._position + 1) * FRAME_NS) if requested else []
         while self._position < frontier and not any(isinstance(output, Event) for output in outputs):
             end = self._stride_end(self._position, frontier)
             outputs += self._close(end)
             self._position = end
-        events = tuple(_dated(output, now_ns, self._late) for output in outputs if isinstance(output, Event))
-        self._forget()
+        events = tuple(self._dated(output, now_ns) for output in outputs if isinstance(output, Event))
+        settled = self.settled
+        if settled is not None:
+            self.input.forget(settled)
         for contribution in (contribution for event in events for contribution in event.contributions):
             self.helped[contribution.array] += contribution.asked
         requests = [output for output in outputs if isinstance(output, BackfillRequest)]
-        settled = self.settled
         return [*requests, FinalResults(events, settled)] if events and settled is not None else [*requests]
 
     def _close(self, end: int) -> list[Output]:
         """Let the final pass close everything up to a frame index."""
-        before = {name: self._ahead(name) for name in self._receptions}
-        outputs = self._final.step(self._held.pop_until(end), (end + 1) * FRAME_NS, complete_until=end)
+        before = {name: self._ahead(name) for name in self._arrays}
+        outputs = self._final.step(self.input.held.pop_until(end), (end + 1) * FRAME_NS, complete_until=end)
         if any(self._ahead(name) != frames for name, frames in before.items()):
-            self._held.reindex(self._ahead)
+            self.input.held.reindex(self._ahead)
         return outputs
 
     def _stride_end(self, position: int, frontier: int) -> int:
@@ -307,22 +234,11 @@ class TwoPassFusion:
 
         During silence this is the frontier, or the frame index before the first held frame.
         """
-        stride, first = position + STRIDE, self._held.first
+        stride, first = position + STRIDE, self.input.held.first
         if not self._final.is_in_event and (first is None or first > stride):
             stride = frontier if first is None else first - 1
         return min(frontier, stride)
 
-    def _forget(self) -> None:
-        settled = self.settled
-        if settled is None or settled == self._forgotten_before:
-            return
-        self._forgotten_before = settled
-        self._late = {frame_index for frame_index in self._late if frame_index >= settled}
-        for name, reception in self._receptions.items():
-            reception.forget(settled + self._ahead(name))
-
-
-def _dated(event: Event, now_ns: int, late: Collection[int]) -> Event:
-    """Return an event as it is reported now; `late` holds the frame indices that the early pass could not use."""
-    is_late = any(event.start_ns <= frame_index * FRAME_NS < event.end_ns for frame_index in late)
-    return replace(event, latency_s=(now_ns - event.end_ns) / 1e9, late=is_late)
+    def _dated(self, event: Event, now_ns: int) -> Event:
+        """Return an event as it is reported now."""
+        return replace(event, latency_s=(now_ns - event.end_ns) / 1e9, late=self.input.was_late(event))

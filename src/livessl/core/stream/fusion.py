@@ -2,7 +2,8 @@
 
 `Fusion.step(messages, now_ns)` is the only entry for messages, live and replayed. It composes the stages: `Alignment`
 puts the frames on one frame index and closes it, `EvidenceCollector` correlates them and collects excerpts, `Verdicts`
-locates and judges these, `EventReporter` decides when an event is reported, and `Tracker` follows the sources.
+locates and judges these, `UpdateSchedule` says which windows are located while a sound goes on, `EventReporter` decides
+when an event is reported, and `Tracker` follows the sources.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from livessl.core.stream.evidence import RELEASE_FRAMES, EvidenceCollector
 from livessl.core.stream.pending_event import EventState, PendingEvent
 from livessl.core.stream.site_state import SiteState
 from livessl.core.stream.tracker import SILENCE_S, Tracker
+from livessl.core.stream.update_schedule import UpdateSchedule
 from livessl.core.stream.verdict import Verdicts
 from livessl.core.types import FRAME_S, Frame, Message, Output, Status, Window
 
@@ -72,11 +74,8 @@ class Fusion:
         )
         self._tracker = Tracker()
         self._event: PendingEvent | None = None
-        self._due: int | None = None  # last frame index of the window that is to be located in this step
-        self.updates_left_out = 0
-        """Number of windows that were not located, because newer ones were due."""
-        self.updates_shed = 0
-        """Number of windows that were not located, because the server was overloaded."""
+        self.updates = UpdateSchedule(state, newest_only=self._role.newest_only)
+        """Decides which windows are located while a sound goes on."""
         self._correct_clocks()
 
     # --- steps
@@ -212,10 +211,7 @@ class Fusion:
         self._alignment.start_over()
         self._collector.discard_ahead()
         self._reporter.start_over()
-        self._state.use_newest()
-        self._state.cache.clear()
-        self._state.votes.clear()
-        self._state.channel_faults.clear()
+        self._state.start_over()
         return outputs
 
     def _close_ready(self) -> list[Output]:
@@ -228,7 +224,8 @@ class Fusion:
                 break
             outputs += self._close(frame_index)
             self._prune()
-        return outputs + self._update_due()
+        due = self.updates.due_in_step()
+        return outputs if self._event is None else outputs + self._update(self._event, due)
 
     def _skip_gap(self) -> list[Output]:
         newest = self._alignment.gap_ends_at()
@@ -258,11 +255,8 @@ class Fusion:
         if event.quiet_frames >= self._parameters.activity.hang_over_frames:
             return self._end(event, became_quiet=True)
         outputs: list[Output] = []
-        if self._role.updates and active and event.length % self._parameters.update_frames == 0:
-            if self._is_update_shed(event):
-                self.updates_shed += 1
-            else:
-                outputs += self._update_now_or_later(event)
+        if self._role.updates and active:
+            outputs += self._update(event, self.updates.due_now(event))
         if event.length * FRAME_S >= self._parameters.max_event_s:
             return outputs + self._end(event, became_quiet=False)
         if event.length % RELEASE_FRAMES == 0:
@@ -277,25 +271,10 @@ class Fusion:
 
     # --- updates
 
-    def _update_due(self) -> list[Output]:
-        """Locate the window that is due in this step, if its event still goes on."""
-        due, self._due, event = self._due, None, self._event
-        if due is None or event is None or event.state is not EventState.OPEN or due < event.start:
+    def _update(self, event: PendingEvent, last: int | None) -> list[Output]:
+        """Locate the window that ends with a frame index, if its event still goes on; None is no window."""
+        if last is None or event.state is not EventState.OPEN or last < event.start:
             return []
-        return self._update(event, due)
-
-    def _is_update_shed(self, event: PendingEvent) -> bool:
-        every = self._state.relief.update_every
-        return every is None or event.length // self._parameters.update_frames % every != 0
-
-    def _update_now_or_later(self, event: PendingEvent) -> list[Output]:
-        if not self._role.newest_only:
-            return self._update(event, event.closed)
-        self.updates_left_out += self._due is not None
-        self._due = event.closed
-        return []
-
-    def _update(self, event: PendingEvent, last: int) -> list[Output]:
         excerpt = self._collector.window(last)
         if len(excerpt.sounds) < self._parameters.min_arrays:
             return []

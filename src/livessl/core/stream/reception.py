@@ -1,4 +1,4 @@
-"""Reception of one array for the final pass (`final_pass`); the early pass uses `ArrayStream`.
+"""Reception of one array for the final pass (`final_input`); the early pass uses `ArrayStream`.
 
 It records how much of the array's sound has come, live and as backlog, in frame indices of the array's own clock. A
 node that reconnects sends its backlog between live frames. Until the backlog is complete, frames are certain only up to

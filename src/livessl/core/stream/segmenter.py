@@ -27,7 +27,7 @@ WARM_UP_FRAMES: Final = 10
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """What is measured of one frame of an array, whatever came before it.
+    """Measurements of one frame of an array, which do not depend on the frames before it.
 
     Parameters
     ----------

@@ -140,6 +140,13 @@ class SiteState:
             self._set_up = self._following[-1][1]
             self._following.clear()
 
+    def start_over(self) -> None:
+        """Forget what was learned of the arrays, because the server's clock was set back."""
+        self.use_newest()
+        self.cache.clear()
+        self.votes.clear()
+        self.channel_faults.clear()
+
     def prepare(self, array: str, sample_rate_hz: float) -> None:
         """Compute in advance what locating an array's sound needs, for the set-up in use and those that follow."""
         for set_up in (self._set_up, *(following for _, following in self._following)):

@@ -148,7 +148,7 @@ class Cut:
 
 @dataclass(frozen=True, slots=True)
 class FramerState:
-    """What marks report of a framer: its counters, and the drift and state of its clock."""
+    """State of a framer that marks report: its counters, and the drift and state of its clock."""
 
     overflows: int
     lost_frames: int

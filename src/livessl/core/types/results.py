@@ -41,22 +41,22 @@ class Estimate:
     position_m : (3,) float64
         Metres, room corner at the origin.
     covariance_m2 : (3, 3) float64
-        Square metres; of the position's whole error. Rows and columns are zero along an axis on which the search volume
-        is flat.
+        Covariance of the position's whole error, in square metres. Rows and columns are zero along an axis on which the
+        search volume is flat.
     confidence : float
-        0 to 1. With `onset`, the probability that the position is right to within 0.5 m, with a set-up as uncertain as
-        the site file says. With other methods, the margin of the map's peak over the next best place; it is not a
-        probability.
+        From 0 to 1. With `onset` it is the probability that the position is within 0.5 m of the source, given errors of
+        the set-up as large as the site file states. With other methods it is the margin of the map's peak over the next
+        best place, which is not a probability.
     arrays : tuple of str
         Arrays from which the position was computed.
     candidates : tuple of Candidate
         The position, and then the places that explain the sound about as well, most probable first; empty if there are
         none.
     set_up_covariance_m2 : (3, 3) float64
-        The part of `covariance_m2` that comes from poses and the speed of sound, as uncertain as the site file says.
-        All sounds from one place have this error in common.
+        The part of `covariance_m2` that comes from errors of the poses and of the speed of sound, as large as the site
+        file states. All sounds from one place have this error in common.
     confidence_of_sound : float or None
-        The confidence with an exact set-up; None if it is `confidence`.
+        The confidence that an exact set-up would give; None if that equals `confidence`.
 
     Raises
     ------
@@ -75,7 +75,7 @@ class Estimate:
 
     @property
     def sound_confidence(self) -> float:
-        """The confidence that does not count the error of the set-up."""
+        """The confidence without the error of the set-up."""
         return self.confidence if self.confidence_of_sound is None else self.confidence_of_sound
 
     @property
@@ -103,7 +103,7 @@ class Contribution:
     array : str
         Name of the array.
     active_s : float
-        Length of its sound that was used, seconds.
+        Length of its sound that was used, in seconds.
     power : float
         In-band mean power of that sound, full scale squared.
     azimuth_deg, elevation_deg, distance_m : float
@@ -137,7 +137,7 @@ class Update:
     event_id : str
         `Event.id` of the event that the sound will become.
     status, estimate, power, contributions, complete_ns
-        As in `Event`, of the window alone.
+        As in `Event`, but of the window alone.
     others : tuple of Estimate
         Further sources that sound at the same time.
     """
@@ -167,7 +167,7 @@ class Event:
         Why the status is not `located`, which outliers were excluded, or by how much the set-up alone may be wrong if
         that is more than 0.5 m; None otherwise.
     estimate : Estimate or None
-        None if it was refused.
+        None if the event was refused.
     power : float or None
         Greatest in-band frame power over all arrays, full scale squared. Of two sources that sounded at the same time,
         each has its share; None for a second source whose share cannot be determined.
@@ -189,7 +189,7 @@ class Event:
         1, or 2 for the second of two sources that sounded at the same time, each of which has an event.
     received : tuple of Received
         What each array received, for the examination of the set-up; empty for a second source and under overload.
-        Events are compared without it.
+        Two events that differ only in it are equal.
     """
 
     id: str
@@ -226,7 +226,7 @@ class Track:
     state : TrackState
         new, update or end.
     time_ns : int
-        Site time of the state below, in nanoseconds.
+        Site time of position and velocity, in nanoseconds.
     position_m, velocity_m_s : (3,) float64
         Metres, metres per second.
     covariance_m2 : (3, 3) float64

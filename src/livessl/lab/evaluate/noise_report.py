@@ -63,6 +63,7 @@ def _blocks(columns: Columns, rows: Sequence[SummaryRow], settings: Mapping[str,
         f"More than {100 * MOST_WRONG:g} % of the positions of `onset` are wrong in: {_named(too_wrong(rows))}. It has "
         f"fewer right sounds than the interval of `srp-phat` begins with in: {_named(below_standard(rows))}.",
         *(block for name in _PART_TITLES for block in _by(rows, name)),
+        *_rooms_and_levels(rows),
         *_others(rows),
         *_confidence(columns),
         *_rooms(settings),
@@ -74,9 +75,32 @@ def _named(cells: Sequence[SummaryRow]) -> str:
 
 
 def _by(rows: Sequence[SummaryRow], name: str) -> list[Block]:
-    here = [row for row in rows if row[name] != ALL and row["sound"] not in OTHER_SOUNDS]
+    here = [row for row in rows if row[name] != ALL and row["snr_db"] == ALL and row["sound"] not in OTHER_SOUNDS]
     title = _PART_TITLES[name]
     return [Heading(2, f"By {title}, over all noise"), Table((title, *_TITLES), [_cells(row, name) for row in here])]
+
+
+def _rooms_and_levels(rows: Sequence[SummaryRow]) -> list[Block]:
+    here = [row for row in rows if row["room"] != ALL and row["snr_db"] != ALL]
+    cells = [
+        (
+            row["room"],
+            f"{row['snr_db']:g} dB",
+            row["method"],
+            str(row["sounds"]),
+            _share(row, "right"),
+            _share(row, "wrong") if row["located"] else "",
+            f"{100 * row['withheld']:.0f} %",
+            f"{100 * (1.0 - row['located'] - row['withheld']):.0f} %",
+        )
+        for row in here
+    ]
+    return [
+        Heading(2, "By room and level, over all kinds of noise"),
+        "*Withheld* are the sounds of which no position is reported. If the best place is *near*, within "
+        f"{NEAR_M:g} m, the sound is lost by its confidence or covariance alone.",
+        Table(("room", "SNR", *_TITLES[:4], "withheld, near", "withheld, elsewhere"), cells),
+    ]
 
 
 def _others(rows: Sequence[SummaryRow]) -> list[Block]:

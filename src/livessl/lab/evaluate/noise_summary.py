@@ -32,7 +32,9 @@ def summary(columns: Columns) -> list[SummaryRow]:
     """Summarize each kind and level of noise by each method, over all rooms and sounds; then each of `PARTS`.
 
     `right` is the share of all sounds that are located within `NEAR_M`; `wrong` is the share of the located ones that
-    are further off, and `at_noise` the share of those within `NEAR_M` of a noise source. Intervals are 95 % intervals
+    are further off, and `at_noise` the share of those within `NEAR_M` of a noise source; `withheld` is the share of all
+    sounds whose best place is within `NEAR_M` but not reported as a position. Each room has a row at each level, too.
+    Intervals are 95 % intervals
     by Wilson, as if sounds were independent. The sounds of `OTHER_SOUNDS` have rows of their own alone.
     """
     levels_db = sorted(set(columns["snr_db"].tolist()), reverse=True)
@@ -40,6 +42,8 @@ def summary(columns: Columns) -> list[SummaryRow]:
     parts: list[dict[str, Any]] = [{"noise": kind, "snr_db": snr_db} for kind in kinds for snr_db in levels_db]
     for name in PARTS:
         parts += [{name: value} for value in dict.fromkeys(columns[name].tolist())]
+    rooms = dict.fromkeys(columns["room"].tolist())
+    parts += [{"room": room, "snr_db": snr_db} for room in rooms for snr_db in levels_db]
     is_other = np.isin(columns["sound"], list(OTHER_SOUNDS))
     rows = []
     for part in parts:
@@ -75,6 +79,7 @@ def _measured(columns: Columns, chosen: BoolArray) -> SummaryRow:
         "median_m": float(np.median(error_m[located])) if located.any() else np.nan,
         "located": (right + wrong) / count,
         "near": float(near.mean()),
+        "withheld": float((near & ~located).mean()),
         "direction": float(directions.mean()),
         "right_direction": float(fits.mean()),
         "at_noise": float((to_noise_m <= NEAR_M).mean()) if len(to_noise_m) else np.nan,

@@ -166,7 +166,7 @@ def make_plan(
     calibration_m : float
         Standard deviation of a microphone's position along any direction, above 0.
     progress : callable or None
-        Called with (arrays tried at other positions, arrays).
+        Called with the number of arrays whose other positions were tried, and the number of all arrays.
 
     Raises
     ------
@@ -201,7 +201,7 @@ def make_plan(
 def predict(
     site: Site, rt60_s: float, height_m: float | None = None, calibration_m: float = CALIBRATION_M
 ) -> Prediction:
-    """Predict the errors of the arrays of a site, where they are; parameters and errors are those of `make_plan`."""
+    """Predict the errors of a site's arrays at their present places; parameters and errors are those of `make_plan`."""
     alpha = absorption(rt60_s, site.room.size_m, site.c_m_s)
     conditions = prediction.Conditions(
         prediction.critical_distance_m(alpha, site.room.size_m),
@@ -246,7 +246,7 @@ def _floor(volume: Grid, height_m: float | None) -> Grid:
 
 
 def _thinned(grid: Grid, most: int) -> Grid:
-    """Return a grid of the same volume with at most a number of points, and not many fewer."""
+    """Return a grid of the same volume with at most `most` points, and not many fewer."""
     spacing = grid.spacing_m
     while Grid(grid.bounds_m, spacing).size > most:
         spacing *= 1.05

@@ -10,6 +10,7 @@ from typing import Final, Protocol
 from livessl.core.types import Status
 from livessl.server.alerts.picture import picture_of
 from livessl.server.api.encode import JsonObject
+from livessl.server.clips.reader import UnreadableClipError
 from livessl.server.zones.zone_map import ZoneMap
 from livessl.site.models import Site
 
@@ -64,14 +65,17 @@ class Evidence:
     async def clip(self, alert: JsonObject, *, waits: bool = True) -> Path | None:
         """Return the clip of an alert's event as soon as it is there, within `CLIP_WAIT_S`.
 
-        None if the site keeps no clips, the alert is about no event with a position, there is none by then, or it is
-        larger than `MAX_CLIP_BYTES`; without `waits`, if there is none now.
+        None if the site keeps no clips, the alert is about no event with a position, there is none by then, it cannot
+        be read, or it is larger than `MAX_CLIP_BYTES`; without `waits`, if there is none now.
         """
         if self._clips is None or alert["event"] is None or alert["event"]["status"] != Status.LOCATED:
             return None
         event_id = alert["event"]["id"]
         for look in range(round(CLIP_WAIT_S / LOOK_S)):
-            path = self._clips.best_file(event_id)
+            try:
+                path = self._clips.best_file(event_id)
+            except UnreadableClipError:  # the folder of the clips has logged it
+                return None
             if path is not None:
                 return path if path.stat().st_size <= MAX_CLIP_BYTES else None
             if not waits or (look * LOOK_S >= QUEUED_S and not self._clips.is_waiting(event_id)):

@@ -92,23 +92,7 @@ class Outbox:
         try:
             self._db = sqlite3.connect(path or ":memory:", timeout=BUSY_S, check_same_thread=False)
             with self._lock, self._db as db:
-                db.execute("PRAGMA journal_mode=WAL")
-                db.execute("PRAGMA secure_delete=ON")  # positions are deleted when their events are
-                db.execute("PRAGMA foreign_keys=ON")
-                db.execute("CREATE TABLE IF NOT EXISTS rules (name TEXT PRIMARY KEY, json TEXT NOT NULL)")
-                db.execute("CREATE TABLE IF NOT EXISTS judged (site TEXT PRIMARY KEY, until_ns INTEGER NOT NULL)")
-                db.execute(
-                    "CREATE TABLE IF NOT EXISTS alerts (number INTEGER PRIMARY KEY AUTOINCREMENT, "
-                    "key TEXT UNIQUE NOT NULL, rule TEXT NOT NULL, time_ns INTEGER NOT NULL, json TEXT NOT NULL)"
-                )
-                db.execute(
-                    "CREATE TABLE IF NOT EXISTS deliveries (number INTEGER PRIMARY KEY AUTOINCREMENT, "
-                    "key TEXT NOT NULL REFERENCES alerts (key) ON DELETE CASCADE, action TEXT NOT NULL, "
-                    "state TEXT NOT NULL, attempts INTEGER NOT NULL, next_ns INTEGER NOT NULL, error TEXT, "
-                    "UNIQUE (key, action))"
-                )
-                db.execute("CREATE INDEX IF NOT EXISTS deliveries_due ON deliveries (action, state, next_ns)")
-                _add_in_journal(db)
+                _create_tables(db)
         except sqlite3.Error as error:
             raise OutboxError(f"alerts.outbox: cannot use {path}: {error}; name a file in a writable folder") from error
 
@@ -332,6 +316,27 @@ class Outbox:
                 return self._db.execute(sql, values).fetchall()
         except sqlite3.Error as error:
             raise OutboxError(f"alerts.outbox: cannot be read: {error}; {CURE}") from error
+
+
+def _create_tables(db: sqlite3.Connection) -> None:
+    """Set the file up, and create the tables that it lacks."""
+    db.execute("PRAGMA journal_mode=WAL")
+    db.execute("PRAGMA secure_delete=ON")  # positions are deleted when their events are
+    db.execute("PRAGMA foreign_keys=ON")
+    db.execute("CREATE TABLE IF NOT EXISTS rules (name TEXT PRIMARY KEY, json TEXT NOT NULL)")
+    db.execute("CREATE TABLE IF NOT EXISTS judged (site TEXT PRIMARY KEY, until_ns INTEGER NOT NULL)")
+    db.execute(
+        "CREATE TABLE IF NOT EXISTS alerts (number INTEGER PRIMARY KEY AUTOINCREMENT, "
+        "key TEXT UNIQUE NOT NULL, rule TEXT NOT NULL, time_ns INTEGER NOT NULL, json TEXT NOT NULL)"
+    )
+    db.execute(
+        "CREATE TABLE IF NOT EXISTS deliveries (number INTEGER PRIMARY KEY AUTOINCREMENT, "
+        "key TEXT NOT NULL REFERENCES alerts (key) ON DELETE CASCADE, action TEXT NOT NULL, "
+        "state TEXT NOT NULL, attempts INTEGER NOT NULL, next_ns INTEGER NOT NULL, error TEXT, "
+        "UNIQUE (key, action))"
+    )
+    db.execute("CREATE INDEX IF NOT EXISTS deliveries_due ON deliveries (action, state, next_ns)")
+    _add_in_journal(db)
 
 
 def _add_in_journal(db: sqlite3.Connection) -> None:

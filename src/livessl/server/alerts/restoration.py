@@ -35,4 +35,4 @@ def restore_alerts(parts: Parts) -> None:
     for alert in missing:
         parts.journal.alert(alert, partial(alerts.note_in_journal, alert) if is_durable else None)
     if parts.hub_link is not None:
-        parts.hub_link.take_alerts(newest)
+        parts.hub_link.messages.take_alerts(newest)

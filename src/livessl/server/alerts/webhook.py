@@ -1,4 +1,4 @@
-"""Webhooks: alerts as HTTP requests, signed as the Standard Webhooks specification says. `courier` tries again."""
+"""Webhooks: alerts as HTTP requests, signed by the Standard Webhooks specification. `courier` repeats failed ones."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SECRET_BYTES: Final = range(24, 65)
 """Lengths of a secret in bytes that the specification allows: 192 to 512 bits."""
 
 MAX_HEAD_BYTES: Final = 16_384
-"""Longest head of an answer that is read; of its body nothing is read."""
+"""Longest head of an HTTP answer that is read, in bytes; its body is not read."""
 
 _STATUS: Final = re.compile(rb"HTTP/1\.[01] ([1-5][0-9]{2})(?: [^\r\n]*)?\r?$")
 _RETRY_AFTER: Final = re.compile(rb"^retry-after:[ \t]*([0-9]{1,9})[ \t]*\r?$", re.IGNORECASE | re.MULTILINE)
@@ -79,7 +79,7 @@ class Webhook:
         Raises
         ------
         DeliveryError
-            If the address does not answer in time, or with another status. 410 says that it is gone for ever.
+            If the address does not answer in time, or answers with another status. 410 means that it is gone for ever.
         """
         try:
             async with asyncio.timeout(self._timeout_s):
@@ -92,7 +92,7 @@ class Webhook:
         _check(head)
 
     def _request(self, alert: JsonObject) -> bytes:
-        """Return the whole request, stamped and signed now."""
+        """Return the whole request, with the present time and the signature."""
         payload = orjson.dumps(
             {"type": "livessl.alert", "timestamp": alert["time_utc"] or alert["raised_utc"], "data": alert}
         )
@@ -127,7 +127,7 @@ class Webhook:
 
 
 def secret_key(text: str) -> bytes | None:
-    """Return the key that the text of a secret stands for; None if it is none."""
+    """Return the key that the text of a secret encodes; None if it is not a valid secret."""
     try:
         key = base64.b64decode(text.removeprefix(SECRET_PREFIX), validate=True)
     except (binascii.Error, ValueError):
@@ -145,7 +145,7 @@ def _check(head: bytes) -> None:
     """Raise DeliveryError unless the head of an answer says that the request was accepted."""
     found = _STATUS.match(head.split(b"\n", 1)[0])
     if found is None:
-        raise DeliveryError(f"expected an answer of HTTP, got {head[:40]!r}")
+        raise DeliveryError(f"expected an HTTP answer, got {head[:40]!r}")
     status = int(found[1])
     if 200 <= status < 300:
         return

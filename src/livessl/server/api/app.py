@@ -65,14 +65,7 @@ def create_app(parts: Parts, access: Access) -> FastAPI:
         openapi_url="/api/v1/openapi.json",
         responses=errors(401, 403) if access.wanted else {},
     )
-    app.add_middleware(_HeadAsGet)
-    app.add_middleware(Gate, access=access, refusals=parts.refusals)
-    if site.server.http.allowed_origins:
-        app.add_middleware(other_origins, http=site.server.http, shown=tuple(routes.MAP_HEADERS))
-    app.add_middleware(HostCheck, names=names, refusals=parts.refusals)
-    app.add_middleware(SafeHeaders, http=site.server.http, page=STATIC / "index.html")
-    app.add_middleware(BehindProxy, http=site.server.http)
-
+    _add_middleware(app, parts, access, names)
     strict = [Depends(refuse_unknown_parameters)]
     for router in (
         routes.state_routes(parts),
@@ -103,6 +96,26 @@ def create_app(parts: Parts, access: Access) -> FastAPI:
 
     app.add_exception_handler(StoreError, _without_database)
     app.add_exception_handler(RequestValidationError, refuse_request)
+    _add_pages(app)
+    if access.wanted:
+        _describe_tokens(app.openapi())
+    return app
+
+
+def _add_middleware(app: FastAPI, parts: Parts, access: Access, names: ServerNames) -> None:
+    """Add what every request passes before it gets to a route; what is added last comes first."""
+    http = parts.site.server.http
+    app.add_middleware(_HeadAsGet)
+    app.add_middleware(Gate, access=access, refusals=parts.refusals)
+    if http.allowed_origins:
+        app.add_middleware(other_origins, http=http, shown=tuple(routes.MAP_HEADERS))
+    app.add_middleware(HostCheck, names=names, refusals=parts.refusals)
+    app.add_middleware(SafeHeaders, http=http, page=STATIC / "index.html")
+    app.add_middleware(BehindProxy, http=http)
+
+
+def _add_pages(app: FastAPI) -> None:
+    """Add the pages of the dashboard and their files."""
 
     @app.get("/", include_in_schema=False)
     async def dashboard() -> FileResponse:
@@ -117,9 +130,6 @@ def create_app(parts: Parts, access: Access) -> FastAPI:
         return FileResponse(STATIC / "embed.html")
 
     app.mount("/static", StaticFiles(directory=STATIC), name="static")
-    if access.wanted:
-        _describe_tokens(app.openapi())
-    return app
 
 
 async def _without_database(_request: Request, error: Exception) -> Response:

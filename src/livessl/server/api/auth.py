@@ -25,7 +25,7 @@ MAX_BODY_BYTES: Final = 65_536
 """Longest body of a request, in bytes; the longest that a route reads has about 20."""
 
 PROTOCOL: Final = "livessl"
-TOKEN_PROTOCOL: Final = "livessl.token."  # noqa: S105 - what stands before a token
+TOKEN_PROTOCOL: Final = "livessl.token."  # noqa: S105 - a prefix, not a token
 """A page cannot set headers of a WebSocket, but it can offer protocols: `livessl` and `livessl.token.TOKEN`."""
 
 HEALTH: Final = "/api/v1/health"
@@ -36,7 +36,7 @@ ANYONE: Final = Client("anyone", Role.ADMIN)
 """Every client of a site without tokens, whose server listens on the local machine only."""
 
 BEARER: Final = Client("a signed link", Role.OPERATOR)
-"""Whoever opens a signed link, for the one path that it is valid for."""
+"""The client that opens a signed link; it may read only the path for which the link is valid."""
 
 RELOAD_S: Final = 1.0
 """Interval, in seconds, at which the tokens file is checked for changes: they take effect without a restart."""
@@ -45,7 +45,7 @@ CLOSE_S: Final = 1.0
 """Longest wait, in seconds, for a client to accept the reason why its connection is closed."""
 
 _SOUND: Final = re.compile(r"/api/v1/(events/[^/]*/clips/.+|listen)", re.DOTALL)
-"""Addresses of recordings and of live sound: sound is for operators, whoever may see where it was."""
+"""Addresses of recordings and of live sound. Only operators may listen; viewers see positions, but get no sound."""
 
 _OPEN: Final = frozenset({"/", "/docs", "/embed", "/history", HEALTH})
 """Addresses that everyone may read: pages without data, and the status."""
@@ -90,7 +90,7 @@ class Access:
         return () if self._tokens is None else self._tokens.clients
 
     def client(self, token: str | None) -> Client | None:
-        """The client that a token was issued to; None if there is none."""
+        """Return the client that a token was issued to; None if there is no such token."""
         if self._tokens is None:
             return ANYONE
         return None if token is None else self._tokens.client(token)
@@ -113,7 +113,7 @@ class Access:
                 _log.error("%s; the former tokens stay in force", error)
 
     def _replace(self, tokens: Tokens) -> None:
-        """Replace the valid tokens, and end what lasts and whose token is revoked or has another role."""
+        """Replace the valid tokens, and end the open connections whose token was revoked or has another role now."""
         self._tokens = tokens
         for revoked, (token, client) in self._open.items():
             if tokens.client(token) != client:
@@ -121,7 +121,7 @@ class Access:
 
     @contextmanager
     def held(self, token: str, client: Client) -> Iterator[asyncio.Event]:
-        """Register a WebSocket or a request; the event is set when its token is revoked or has another role."""
+        """Register a WebSocket or a request; the event is set when its token is revoked or gets another role."""
         revoked = asyncio.Event()
         self._open[revoked] = token, client
         try:
@@ -183,7 +183,7 @@ class Gate:
 
 
 def caller(scope: Scope) -> str:
-    """Address of the client, for the list of refusals."""
+    """Return the address of the client, for the list of refusals."""
     return str((scope["client"] or ("a local socket",))[0])
 
 
@@ -241,9 +241,9 @@ def _refusal(scope: Scope, client: Client | None) -> tuple[int, str] | None:
 
 
 def _without_link(scope: Scope) -> tuple[Scope, tuple[str, str, str] | None]:
-    """Return a request without the parameters that sign its address, and path, expiry and signature of the link.
+    """Split a request with a signed address into the request without the signature, and the parts of the link.
 
-    These are None if the address is not signed, or is one that no link opens.
+    These are its path, expiry and signature; None if the address is not signed, or is one that no link opens.
     """
     path = _path(scope)
     if scope["type"] != "http" or scope["method"] not in ("GET", "HEAD") or not is_linkable(path):
@@ -283,7 +283,7 @@ def _token(scope: Scope) -> str | None:
 
 
 def _choosing_protocol(scope: Scope, send: Send) -> Send:
-    """Return a `send` that accepts the protocol `livessl`, not the one with the token: browsers want one accepted."""
+    """Return a `send` that accepts the protocol `livessl`: a browser needs one of its offers accepted."""
     if PROTOCOL not in scope.get("subprotocols", ()):
         return send
 

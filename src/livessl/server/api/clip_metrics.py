@@ -18,6 +18,11 @@ def clip_metrics(parts: Parts) -> Iterator[Metric]:
         return
     yield GaugeMetricFamily("livessl_clips_stored", "Events with recordings.", clips.folder.count)
     yield GaugeMetricFamily("livessl_clips_bytes", "Size of all recordings.", clips.folder.nbytes)
+    yield GaugeMetricFamily(
+        "livessl_clips_unreadable",
+        "Events with recordings that could not be read when they were last needed.",
+        clips.folder.unreadable,
+    )
     yield GaugeMetricFamily("livessl_clips_waiting", "Events whose recordings are being made.", clips.waiting)
     results = CounterMetricFamily(
         "livessl_clips", "What has become of events that should have recordings.", labels=["result"]

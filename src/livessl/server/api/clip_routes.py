@@ -17,6 +17,7 @@ from livessl.schema.answers import errors
 from livessl.server.api import clip_schema
 from livessl.server.api.encode import API_VERSION
 from livessl.server.api.routes import as_json
+from livessl.server.clips.reader import Clip, UnreadableClipError
 from livessl.server.clips.relocate import known_methods
 from livessl.server.clips.service import Clips, state_of
 from livessl.server.clips.stored_sound import is_relocatable
@@ -36,6 +37,7 @@ _SOUND: Final[dict[int | str, dict[str, Any]]] = {
 
 _NO_CLIP: Final = "The event has no recordings."
 _NO_FILE: Final = "The event has no recording of that name."
+_UNREADABLE: Final = "What is stored about the recordings, or the recording itself, cannot be read."
 _DISK: Final = "The folder of the clips cannot be written."
 _log = logging.getLogger(__name__)
 
@@ -57,28 +59,33 @@ def clip_routes(parts: Parts) -> APIRouter:
 
     @router.get("/events/{event_id}/clips", response_model=clip_schema.EventClips)
     def get_event_clips(event_id: str) -> Response:
-        """Recordings of an event."""
-        about = None if clips is None else clips.folder.complete(event_id)
-        waits = clips is not None and clips.is_waiting(event_id)
+        """Recordings of an event. Where `state` is `unreadable`, `problem` says why."""
+        clip: Clip | None = None
+        problem = None
+        try:
+            clip = None if clips is None else clips.folder.read(event_id)
+        except UnreadableClipError as error:
+            problem = str(error)
         found = {
             "v": API_VERSION,
             "event_id": event_id,
-            "state": "stored" if about is not None else "waiting" if waits else "none",
-            "keep": about is not None and about["keep"],
-            "position_m": None if about is None else about["position_m"],
-            "files": [] if about is None else about["files"],
-            "methods": list(known_methods(parts.site)) if about is not None and is_relocatable(about) else [],
+            "state": _state(clips, event_id, clip, problem),
+            "problem": problem,
+            "keep": clip is not None and clip.keep,
+            "position_m": None if clip is None else clip.content["position_m"],
+            "files": [] if clip is None else clip.files,
+            "methods": list(known_methods(parts.site)) if clip is not None and is_relocatable(clip) else [],
         }
         return as_json(found)
 
     @router.put(
         "/events/{event_id}/clips/keep",
         response_model=clip_schema.Kept,
-        responses=errors(400, 404, 411, 413, 503, texts={404: _NO_CLIP, 503: _DISK}),
+        responses=errors(400, 404, 409, 411, 413, 503, texts={404: _NO_CLIP, 409: _UNREADABLE, 503: _DISK}),
     )
     def put_keep(event_id: str, switch: clip_schema.KeepSwitch, request: Request) -> Response:
         """Keep an event's recordings for ever, or no longer; for operators."""
-        with _disk_errors():
+        with _disk_errors(), _unreadable():
             if clips is None or not clips.folder.keep(event_id, switch.keep):
                 raise _no_clip(event_id)
         what = "keeps" if switch.keep else "no longer keeps"
@@ -91,7 +98,10 @@ def clip_routes(parts: Parts) -> APIRouter:
         responses=errors(404, 411, 413, 503, texts={404: _NO_CLIP, 503: _DISK}),
     )
     def delete_clips(event_id: str, request: Request) -> Response:
-        """Delete an event's recordings, also those that are kept for ever; the event stays. For operators."""
+        """Delete an event's recordings, also those that are kept for ever or unreadable; the event stays.
+
+        For operators.
+        """
         with _disk_errors():
             if clips is None or not clips.folder.delete(event_id):
                 raise _no_clip(event_id)
@@ -107,11 +117,12 @@ def _add_recordings(router: APIRouter, clips: Clips | None) -> None:
     @router.get(
         "/events/{event_id}/clips/best",
         response_class=Response,
-        responses=_SOUND | errors(404, texts={404: "The event has no recordings, or none yet."}),
+        responses=_SOUND | errors(404, 409, texts={404: "The event has no recordings, or none yet.", 409: _UNREADABLE}),
     )
     def get_best_clip(event_id: str) -> Response:
         """The recording that people listen to first, the enhanced one if there is one; for operators."""
-        path = None if clips is None else clips.best_file(event_id)
+        with _unreadable():
+            path = None if clips is None else clips.best_file(event_id)
         if path is None:
             if clips is not None and clips.is_waiting(event_id):
                 raise HTTPException(404, f"the recordings of event {event_id!r} are being made; try again in seconds")
@@ -121,7 +132,7 @@ def _add_recordings(router: APIRouter, clips: Clips | None) -> None:
     @router.get(
         "/events/{event_id}/clips/{name}",
         response_class=Response,
-        responses=_SOUND | errors(404, texts={404: _NO_FILE}),
+        responses=_SOUND | errors(404, 409, texts={404: _NO_FILE, 409: _UNREADABLE}),
     )
     def get_clip(
         event_id: str,
@@ -131,11 +142,13 @@ def _add_recordings(router: APIRouter, clips: Clips | None) -> None:
         ] = "stored",
     ) -> Response:
         """A recording, for operators. `Range` gives parts of it as it is stored."""
-        path = None if clips is None else clips.folder.file(event_id, name)
+        with _unreadable():
+            clip = None if clips is None else clips.folder.read(event_id)
+        path = None if clip is None else clip.file(name)
         if path is None:
             raise HTTPException(404, f"event {event_id!r} has no recording {name!r}; GET events/ID/clips lists them")
         if format == "wav" and path.suffix != ".wav":
-            return Response(_as_wav(path), media_type=MEDIA_TYPES[".wav"])
+            return Response(_as_wav(event_id, path), media_type=MEDIA_TYPES[".wav"])
         return _sound_file(path)
 
 
@@ -146,6 +159,14 @@ def _sound_file(path: Path, filename: str | None = None) -> Response:
     return FileResponse(
         path, media_type=media_type, headers=headers, filename=filename, content_disposition_type="inline"
     )
+
+
+def _state(clips: Clips | None, event_id: str, clip: Clip | None, problem: str | None) -> str:
+    if clip is not None:
+        return "stored"
+    if problem is not None:
+        return "unreadable"
+    return "waiting" if clips is not None and clips.is_waiting(event_id) else "none"
 
 
 def _no_clip(event_id: str) -> HTTPException:
@@ -161,9 +182,21 @@ def _disk_errors() -> Iterator[None]:
         raise HTTPException(503, f"server.clips.folder: {error.strerror or error}; correct that") from error
 
 
-def _as_wav(path: Path) -> bytes:
-    """Return a recording as a WAV file of 24 bits."""
-    samples, rate_hz = soundfile.read(path, dtype="int32", always_2d=True)
+@contextmanager
+def _unreadable() -> Iterator[None]:
+    """Answer 409 where what is stored about recordings cannot be read."""
+    try:
+        yield
+    except UnreadableClipError as error:
+        raise HTTPException(409, str(error)) from error
+
+
+def _as_wav(event_id: str, path: Path) -> bytes:
+    """Return a recording as a WAV file of 24 bits; answer 409 if it is damaged."""
+    try:
+        samples, rate_hz = soundfile.read(path, dtype="int32", always_2d=True)
+    except (OSError, soundfile.SoundFileError) as error:
+        raise HTTPException(409, f"event {event_id!r}: {path.name} cannot be read: {error}; delete it") from error
     made = io.BytesIO()
     soundfile.write(made, samples, rate_hz, format="WAV", subtype="PCM_24")
     return made.getvalue()

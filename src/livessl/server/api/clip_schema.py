@@ -6,46 +6,8 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from livessl.schema.values import PositionM, UtcTime, Version
-
-
-class ClipBeam(BaseModel):
-    """The part of one array in an enhanced clip."""
-
-    array: str = Field(description="Name of the array.", examples=["north"])
-    share: float = Field(ge=0, le=1, description="Share of the signal; 0 for an array that was left out.")
-    lag_s: float = Field(
-        description="Seconds by which its beam was later than the first one's after known offsets of the clocks and "
-        "travel times were subtracted; it is corrected."
-    )
-    snr_db: float | None = Field(
-        description="Signal-to-noise ratio of its beam in dB; null if there was no quiet before the sound."
-    )
-
-
-class ClipFile(BaseModel):
-    """One recording of a clip."""
-
-    name: str = Field(description="Name in the address of the recording.", examples=["array-north.flac"])
-    kind: Literal["array", "enhanced"] = Field(
-        description="`array`: what the microphones of one array recorded. `enhanced`: one signal, beamed at the place."
-    )
-    array: str | None = Field(description="Name of the array; null for `enhanced`.", examples=["north"])
-    channels: int = Field(ge=1, description="Number of channels, in the order of the array's microphones.")
-    sample_rate_hz: int = Field(gt=0, description="Sampling rate in hertz.", examples=[44100])
-    duration_s: float = Field(ge=0, description="Length in seconds.")
-    bytes: int = Field(ge=0, description="Size of the stored file.")
-    time_utc: UtcTime = Field(
-        description="Time of the first sample: at the array, or for `enhanced` at the source, which is earlier."
-    )
-    pre_roll_s: float = Field(description="Length of the recording before the event's start, in seconds.")
-    post_roll_s: float = Field(description="Length of the recording after the event's end, in seconds.")
-    gaps_s: list[list[float]] = Field(
-        description="Begin and end of each gap, in seconds after the first sample; samples there are zero.",
-        examples=[[[0.4, 0.55]]],
-    )
-    gain_db: float = Field(description="Gain by which the signal was made louder for listening.", examples=[18.5])
-    beams: list[ClipBeam] = Field(description="Arrays of an enhanced signal, the best first; empty for `array`.")
+from livessl.schema.clips import ClipFile
+from livessl.schema.values import PositionM, Version
 
 
 class EventClips(BaseModel):
@@ -53,8 +15,12 @@ class EventClips(BaseModel):
 
     v: Version
     event_id: str = Field(description="Id of the event.", examples=["lab-35340000000"])
-    state: Literal["none", "waiting", "stored"] = Field(
-        description="`waiting`: the recordings are being made. `none`: there are none and there will be none."
+    state: Literal["none", "waiting", "stored", "unreadable"] = Field(
+        description="`waiting`: the recordings are being made. `none`: there are none and there will be none. "
+        "`unreadable`: there are some, and what the server has stored about them is damaged or of another release."
+    )
+    problem: str | None = Field(
+        description="Why the recordings are `unreadable`, and what to do; null otherwise.", examples=[None]
     )
     keep: bool = Field(description="Whether the recordings are kept for ever.")
     position_m: PositionM | None = Field(description="Place at which the enhanced signal is beamed; null if none.")
@@ -75,6 +41,9 @@ class ClipsState(BaseModel):
     max_bytes: int | None = Field(description="Size beyond which the oldest are deleted; null if not enabled.")
     max_age_days: float | None = Field(description="Age at which recordings are deleted; null for none.")
     kept: int = Field(ge=0, description="Events whose recordings are kept for ever.")
+    unreadable: int = Field(
+        ge=0, description="Events with recordings that could not be read when they were last needed."
+    )
     waiting: int = Field(ge=0, description="Events whose recordings are being made.")
     frames_dropped: int = Field(ge=0, description="Frames that no recording can have, for want of memory.")
     written: int = Field(ge=0, description="Events whose recordings were stored.")

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import logging
 import os
-import re
 import shutil
 import threading
 from collections.abc import Callable, Mapping
@@ -18,26 +17,13 @@ from typing import Any, Final
 
 import orjson
 
-from livessl.errors import RunError
-
-ABOUT: Final = "clip.json"
-"""File about a clip's recordings."""
-
-SUFFIXES: Final = (".flac", ".wav")
-"""Ends of the names of recordings."""
+from livessl.server.clips.reader import ABOUT, SAFE, Clip, ClipReader, ClipsError, UnreadableClipError, parsed
 
 PARTIAL: Final = ".partial-"
 """Beginning of the name of a folder that is being written or deleted."""
 
-_SAFE: Final = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,199}")
 _ZEROS: Final = bytes(1 << 16)
 _log = logging.getLogger(__name__)
-
-About = dict[str, Any]
-
-
-class ClipsError(RunError):
-    """The folder of clips cannot be used."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,54 +33,6 @@ class _Entry:
     start_ns: int
     nbytes: int
     keep: bool
-
-
-class ClipReader:
-    """The clips in a folder, to be read only; another process may write and delete them.
-
-    Parameters
-    ----------
-    path : Path
-    """
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-
-    def ids(self) -> list[str]:
-        """Return the ids of the events that have a clip, in order of their names.
-
-        Raises
-        ------
-        ClipsError
-            If the folder cannot be read.
-        """
-        try:
-            folders = [folder for folder in self._path.iterdir() if _SAFE.fullmatch(folder.name)]
-            return sorted(folder.name for folder in folders if (folder / ABOUT).is_file())
-        except OSError as error:
-            raise ClipsError(f"{self._path}: expected a folder of clips: {error.strerror or error}; name it") from error
-
-    def about(self, event_id: str) -> About | None:
-        """Return what `clip.json` says of an event's clip, whatever that is; None if it has none."""
-        if not _SAFE.fullmatch(event_id):
-            return None
-        try:
-            return _parsed((self._path / event_id / ABOUT).read_bytes())
-        except OSError:
-            return None
-
-    def complete(self, event_id: str) -> About | None:
-        """Return what is known of an event's clip; None if it has none, or one that another program has changed."""
-        about = self.about(event_id)
-        return about if about is not None and _is_complete(about) else None
-
-    def file(self, event_id: str, name: str) -> Path | None:
-        """Return the path of one of a clip's recordings; None if there is none of that name."""
-        about = self.complete(event_id)
-        if about is None or name not in {each["name"] for each in about["files"]}:
-            return None
-        path = self._path / event_id / name
-        return path if path.is_file() else None
 
 
 class ClipFolder(ClipReader):
@@ -116,6 +54,7 @@ class ClipFolder(ClipReader):
         self._lock = threading.RLock()
         self._erasing = threading.Lock()  # is never held while waiting for the other lock
         self._entries: dict[str, _Entry] = {}
+        self._unreadable: dict[str, str] = {}  # reasons
         try:
             path.mkdir(mode=0o700, parents=True, exist_ok=True)
             probe = path / f"{PARTIAL}probe"
@@ -128,7 +67,11 @@ class ClipFolder(ClipReader):
             ) from error
 
     def load(self) -> None:
-        """Read what is there, and delete what a killed server has left unfinished; what fails is left, and logged."""
+        """Read what is there, and delete what a killed server has left unfinished; what fails is left, and logged.
+
+        Unreadable clips count with the size of their files and the time of `clip.json`, so that age and room delete
+        them, too.
+        """
         try:
             folders = sorted(self._path.iterdir())
         except OSError as error:
@@ -143,28 +86,46 @@ class ClipFolder(ClipReader):
                     folder,
                     error.strerror or error,
                 )
-            except (KeyError, TypeError, ValueError) as error:
-                _log.warning(
-                    "%s: expected a complete %s, got an unknown one (%r); delete the folder", folder, ABOUT, error
-                )
 
     def _load(self, folder: Path) -> None:
         if folder.name.startswith(PARTIAL):
             self._finish(folder)
         elif folder.is_dir():
-            if not (folder / ABOUT).exists() or not _SAFE.fullmatch(folder.name):
-                _log.warning("%s: expected a clip with %s, got none; it is left alone", folder, ABOUT)
-                return
             with self._lock:  # an operator may delete it meanwhile
-                about = _parsed((folder / ABOUT).read_bytes())
-                if about is not None:
-                    self._note(folder.name, about)
+                if self.has(folder.name):
+                    self._entries[folder.name] = self._entry(folder)
                     return
-            _log.warning("%s: %s is empty or damaged; the folder is deleted", folder, ABOUT)
-            going = self._path / f"{PARTIAL}going-{folder.name}"
-            self._finish(going)
-            folder.rename(going)
-            self._finish(going)
+            _log.warning("%s: expected a clip with %s, got none; it is left alone", folder, ABOUT)
+
+    def _entry(self, folder: Path) -> _Entry:
+        try:
+            clip = self.read(folder.name)
+        except UnreadableClipError:
+            clip = None
+        if clip is not None:
+            return _Entry(clip.start_ns, clip.nbytes, clip.keep)
+        sizes = [path.stat().st_size for path in folder.iterdir()]
+        return _Entry((folder / ABOUT).stat().st_mtime_ns, sum(sizes), keep=False)
+
+    def read(self, event_id: str) -> Clip | None:
+        """Return an event's clip as `ClipReader` does; one that is unreadable is counted, and logged once."""
+        try:
+            clip = super().read(event_id)
+        except UnreadableClipError as error:
+            with self._lock:
+                is_known = self._unreadable.get(event_id) == str(error)
+                self._unreadable[event_id] = str(error)
+            if not is_known:
+                _log.warning("server.clips.folder: %s", error)
+            raise
+        with self._lock:
+            self._unreadable.pop(event_id, None)
+        return clip
+
+    @property
+    def unreadable(self) -> int:
+        """Number of clips that could not be read when they were last needed."""
+        return len(self._unreadable)
 
     @property
     def nbytes(self) -> int:
@@ -189,44 +150,44 @@ class ClipFolder(ClipReader):
         with self._lock:
             return sum(entry.nbytes for entry in self._entries.values() if entry.keep)
 
-    def put(self, event_id: str, write: Callable[[Path], Mapping[str, Any]]) -> About:
+    def put(self, event_id: str, write: Callable[[Path], Mapping[str, Any]]) -> Clip:
         """Store a clip in place of an earlier one of the same event, which stays kept for ever if it was.
 
         Parameters
         ----------
         event_id : str
         write : callable
-            Writes the recordings into a folder and returns what to say of them: `start_ns` and `files` with `name` and
-            `bytes` at least.
+            Writes the recordings into a folder and returns what to say of them, as `ClipHead` describes it, but for
+            `keep`; more is stored, too.
 
         Raises
         ------
         OSError
             If the disk does not take it; nothing is left of it then.
+        UnreadableClipError
+            If what is to be said of them has another form.
         ValueError
             If the id cannot be the name of a folder.
         """
-        if not _SAFE.fullmatch(event_id):
+        if not SAFE.fullmatch(event_id):
             raise ValueError(f"clip: expected an event id of letters, digits, '.', '_' or '-', got {event_id!r}")
         partial = self._path / f"{PARTIAL}{event_id}"
         _erase(partial)
         try:
             partial.mkdir(mode=0o700)
-            about = {**write(partial), "keep": False}
+            about = dict(write(partial))
             with self._lock:
-                earlier = self.about(event_id)
-                about["keep"] = earlier is not None and bool(earlier.get("keep"))
-                _write_through(partial / ABOUT, orjson.dumps(about))
+                clip = self._written(partial / ABOUT, event_id, about | {"keep": self._is_kept(event_id)})
                 going = self._set_aside(event_id)
-                partial.rename(self._path / event_id)
-                self._note(event_id, about)
+                partial.rename(clip.path)
+                self._entries[event_id] = _Entry(clip.start_ns, clip.nbytes, clip.keep)
         except BaseException:
             with suppress(OSError):
                 _erase(partial)
             raise
         if going is not None:
             self._finish(going)
-        return about
+        return clip
 
     def keep(self, event_id: str, keep: bool) -> bool:
         """Keep a clip for ever, or no longer; return False if there is none.
@@ -235,17 +196,32 @@ class ClipFolder(ClipReader):
         ------
         OSError
             If the disk does not take it.
+        UnreadableClipError
         """
         with self._lock:
-            about = self.complete(event_id)
-            if about is None:
+            clip = self.read(event_id)
+            if clip is None:
                 return False
-            path = self._path / event_id / ABOUT
-            fresh = path.with_name(f"{PARTIAL}{ABOUT}")
-            _write_through(fresh, orjson.dumps({**about, "keep": keep}))
-            fresh.replace(path)
-            self._note(event_id, {**about, "keep": keep})
+            fresh = clip.path / f"{PARTIAL}{ABOUT}"
+            clip = self._written(fresh, event_id, {**clip.content, "keep": keep})
+            fresh.replace(clip.path / ABOUT)
+            self._entries[event_id] = _Entry(clip.start_ns, clip.nbytes, keep)
             return True
+
+    def _written(self, path: Path, event_id: str, about: Mapping[str, Any]) -> Clip:
+        """Write the file about a clip through to the disk, if it can be read again."""
+        data = orjson.dumps(about)
+        clip = parsed(event_id, self._path / event_id, data)
+        _write_through(path, data)
+        return clip
+
+    def _is_kept(self, event_id: str) -> bool:
+        try:
+            clip = self.read(event_id)
+        except UnreadableClipError:
+            entry = self._entries.get(event_id)
+            return entry is not None and entry.keep
+        return clip is not None and clip.keep
 
     def delete(self, event_id: str) -> bool:
         """Overwrite and delete an event's clip; return False if there is none.
@@ -315,49 +291,26 @@ class ClipFolder(ClipReader):
         None if there is no clip, or not the expected one.
         """
         with self._lock:
-            if self.about(event_id) is None or (expected is not None and self._entries.get(event_id) != expected):
+            if not self.has(event_id) or (expected is not None and self._entries.get(event_id) != expected):
                 return None
             going = self._path / f"{PARTIAL}going-{event_id}"
             self._finish(going)
             (self._path / event_id).rename(going)
             self._entries.pop(event_id, None)
+            self._unreadable.pop(event_id, None)
             return going
 
     def _forget_removed(self) -> None:
         """Forget the clips whose folders are gone; the lock is held, so that none of them is just being replaced."""
         there = {folder.name for folder in os.scandir(self._path)}
-        for event_id in self._entries.keys() - there:
-            del self._entries[event_id]
+        for known in (self._entries, self._unreadable):
+            for event_id in known.keys() - there:
+                del known[event_id]
 
     def _finish(self, going: Path) -> None:
         """Erase a folder that was set aside; two threads may do so at once."""
         with self._erasing:
             _erase(going)
-
-    def _note(self, event_id: str, about: Mapping[str, Any]) -> None:
-        nbytes = sum(int(each["bytes"]) for each in about["files"])
-        with self._lock:
-            self._entries[event_id] = _Entry(int(about["start_ns"]), nbytes, bool(about["keep"]))
-
-
-def _parsed(data: bytes) -> About | None:
-    """Return the content of the file about a clip; None if it is empty or damaged."""
-    try:
-        about = orjson.loads(data)
-    except orjson.JSONDecodeError:
-        return None
-    return about if isinstance(about, dict) else None
-
-
-def _is_complete(about: About) -> bool:
-    """Return whether the file about a clip says what the server needs of it."""
-    try:
-        int(about["start_ns"])
-        names = [str(each["name"]) for each in about["files"] if int(each["bytes"]) >= 0]
-    except (KeyError, TypeError, ValueError, OverflowError):
-        return False
-    known = isinstance(about.get("keep"), bool) and isinstance(about.get("position_m"), list | None)
-    return known and all(Path(name).suffix in SUFFIXES for name in names)
 
 
 def _write_through(path: Path, data: bytes) -> None:

@@ -26,12 +26,13 @@ from livessl.core.types import (
     Output,
     Status,
 )
-from livessl.server.clips.folder import ClipReader
+from livessl.server.clips.reader import ClipReader
 from livessl.server.clips.stored_sound import (
     MOST_BYTES,
     RelocationError,
     StoredSound,
     check_memory,
+    stored_clip,
     stored_frames,
     stored_sound,
 )
@@ -122,7 +123,19 @@ def relocate(
         If the clip does not fit: another release has made it, it is damaged, an array is no longer there, a file cannot
         be read, it takes more than `most_bytes`, or no sound of the event is in it.
     """
-    sound = stored_sound(folder, event_id)
+    return relocate_sound(site, stored_sound(stored_clip(folder, event_id)), method, set_up, give_way, most_bytes)
+
+
+def relocate_sound(
+    site: Site,
+    sound: StoredSound,
+    method: str,
+    set_up: SetUp,
+    give_way: GiveWay = _go_on,
+    most_bytes: int | None = None,
+) -> Relocation:
+    """Locate an event again from its sound, as `relocate` does."""
+    event_id = sound.event_id
     if most_bytes is not None:
         check_memory(sound, most_bytes)
     specs = _specs(site, sound)
@@ -133,7 +146,7 @@ def relocate(
     frames: list[Frame] = []
     for array in sound.arrays:
         give_way()
-        frames += stored_frames(folder, event_id, array)
+        frames += stored_frames(sound, array)
     sources = _sources(site, frames, method, sound, give_way)
     if not sources:
         raise RelocationError(

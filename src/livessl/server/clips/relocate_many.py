@@ -15,9 +15,9 @@ from livessl import __version__
 from livessl.core.types import ArraySpec
 from livessl.errors import ConfigError
 from livessl.server.api.encode import JsonObject, answer
-from livessl.server.clips.folder import ClipReader
-from livessl.server.clips.relocate import SetUp, distance_m, relocate
-from livessl.server.clips.stored_sound import RelocationError, stored_sound
+from livessl.server.clips.reader import ClipReader
+from livessl.server.clips.relocate import SetUp, distance_m, relocate_sound
+from livessl.server.clips.stored_sound import RelocationError, stored_clip, stored_sound
 from livessl.site.models import Site
 from livessl.workers import on_cores
 
@@ -68,32 +68,32 @@ def _decisive(spec: ArraySpec) -> JsonObject:
 
 def relocate_one(task: Task, event_id: str) -> JsonObject:
     """Locate an event again; return both answers, or the first one and why there is no second."""
-    folder = ClipReader(task.folder)
-    about = folder.about(event_id) or {}
     found: JsonObject = {
         "kind": "relocation",
         "event_id": event_id,
-        "time_utc": about.get("time_utc"),
+        "time_utc": None,
         "method": task.method,
         "set_up": task.set_up,
         "digest": task.digest,
         "moved_arrays": [],
-        "stored": about.get("answer"),
+        "stored": None,
         "again": None,
         "other_sources": [],
         "distance_m": None,
         "error": None,
     }
     try:
-        stored = stored_sound(folder, event_id).answer
-        again = relocate(task.site, folder, event_id, task.method or stored["method"], task.set_up)
+        clip = stored_clip(ClipReader(task.folder), event_id)
+        found |= {"time_utc": clip.content.get("time_utc"), "stored": clip.content.get("answer")}
+        sound = stored_sound(clip)
+        again = relocate_sound(task.site, sound, task.method or sound.answer["method"], task.set_up)
     except (RelocationError, ConfigError) as error:
         return found | {"error": str(error)}
     return found | {
         "moved_arrays": list(again.moved),
         "again": answer(again.event),
         "other_sources": [answer(other) for other in again.others],
-        "distance_m": distance_m(stored["position_m"], again.event),
+        "distance_m": distance_m(sound.answer["position_m"], again.event),
     }
 
 

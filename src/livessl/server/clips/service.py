@@ -201,11 +201,18 @@ class Clips:
     # --- the thread
 
     def best_file(self, event_id: str) -> Path | None:
-        """Return the recording that people listen to first: the enhanced one, or that of the first array."""
-        about = self.folder.complete(event_id)
-        names = [] if about is None else [each["name"] for each in about["files"]]
+        """Return the recording that people listen to first: the enhanced one, or that of the first array.
+
+        Raises
+        ------
+        UnreadableClipError
+        """
+        clip = self.folder.read(event_id)
+        if clip is None:
+            return None
+        names = [file["name"] for file in clip.files]
         name = ENHANCED if ENHANCED in names else next(iter(names), None)
-        return None if name is None else self.folder.file(event_id, name)
+        return None if name is None else clip.file(name)
 
     def start(self) -> None:
         """Begin to cut clips."""
@@ -325,6 +332,7 @@ def state_of(clips: Clips | None) -> JsonObject:
         "clips": 0 if folder is None else folder.count,
         "bytes": 0 if folder is None else folder.nbytes,
         "kept": 0 if folder is None else folder.kept,
+        "unreadable": 0 if folder is None else folder.unreadable,
         "waiting": 0 if clips is None else clips.waiting,
         "frames_dropped": 0 if clips is None else clips.frames_dropped,
         **asdict(counts),

@@ -1,6 +1,6 @@
 """Reads what locating an event again needs from its clip: the set-up at that time, the frames and their samples.
 
-Nothing in `clip.json` is relied on before it is checked: another release may have written it, or a disk damaged it.
+`reader` has checked what every clip says; what only locating again needs is checked here.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import soundfile
 from livessl.core.types import FRAME_NS, Float32Array, FloatArray, Frame, Uncertainty
 from livessl.errors import RunError
 from livessl.server.clips.cut import CutFrame
-from livessl.server.clips.folder import ABOUT, ClipReader
+from livessl.server.clips.reader import ABOUT, Clip, ClipReader, UnreadableClipError
 
 MOST_BYTES: Final = 256_000_000
 """Most bytes of decoded samples that a server holds to locate one event again. A sound of 60 s, the longest event, at
@@ -27,8 +27,16 @@ MOST_OFF_S: Final = 3600.0
 """Largest distance, in seconds, between the event and a frame of its clip; the fusion steps through all frame indices
 between, so that one damaged index would never end."""
 
+_SPEEDS_M_S: Final = (100.0, 2000.0)
+_RATES_HZ: Final = (100.0, 1e6)
+_MOST_M: Final = 1000.0
+_MOST_UNCERTAINTY: Final = 100.0
+"""Limits of the speed of sound, the sampling rate, the coordinates of microphones, and of what they may be off by, as a
+site file has them or wider. Correlations are as long as the way across an array takes: a damaged number would make them
+fill the memory."""
+
 _UNREADABLE: Final = (AttributeError, KeyError, OverflowError, TypeError, ValueError)
-"""Errors that reading a `clip.json` of another form raises."""
+"""Errors that reading arrays and frames of another form raises."""
 
 
 class RelocationError(RunError):
@@ -79,13 +87,12 @@ class StoredArray:
 
 @dataclass(frozen=True, slots=True)
 class StoredSound:
-    """What a clip says of an event's sound.
+    """The sound of an event, as its clip describes it.
 
     Parameters
     ----------
-    event_id : str
-    start_ns : int
-        Begin of the event, nanoseconds since the epoch.
+    clip : Clip
+        The clip itself.
     duration_s : float
     c_m_s : float
         Speed of sound by which the event was located, m/s.
@@ -94,45 +101,65 @@ class StoredSound:
     arrays : tuple of StoredArray
     """
 
-    event_id: str
-    start_ns: int
+    clip: Clip
     duration_s: float
     c_m_s: float
     answer: Mapping[str, Any]
     arrays: tuple[StoredArray, ...]
 
+    @property
+    def event_id(self) -> str:
+        """Id of the event."""
+        return self.clip.event_id
 
-def is_relocatable(about: Mapping[str, Any]) -> bool:
+    @property
+    def start_ns(self) -> int:
+        """Begin of the event, nanoseconds since the epoch."""
+        return self.clip.start_ns
+
+
+def is_relocatable(clip: Clip) -> bool:
     """Return whether a clip says of its frames what locating again needs."""
-    return bool(about.get("arrays"))
+    return bool(clip.content.get("arrays"))
 
 
-def stored_sound(folder: ClipReader, event_id: str) -> StoredSound:
-    """Return what an event's clip says of its sound; reads no recording.
+def stored_clip(folder: ClipReader, event_id: str) -> Clip:
+    """Return an event's clip.
 
     Raises
     ------
     NoClipError
         If the event has no recordings.
     RelocationError
+        If the clip is unreadable.
+    """
+    try:
+        clip = folder.read(event_id)
+    except UnreadableClipError as error:
+        raise RelocationError(str(error)) from error
+    if clip is None:
+        raise NoClipError(f"event {event_id!r} has no recordings; it cannot be located again without its sound")
+    return clip
+
+
+def stored_sound(clip: Clip) -> StoredSound:
+    """Return what an event's clip says of its sound; reads no file.
+
+    Raises
+    ------
+    RelocationError
         If an earlier or later release has made the clip, or it is damaged.
     """
-    about = folder.about(event_id)
-    if about is None:
-        raise NoClipError(f"event {event_id!r} has no recordings; it cannot be located again without its sound")
-    if not is_relocatable(about):
+    if not is_relocatable(clip):
         raise RelocationError(
-            f"the recordings of {event_id!r} are of an earlier release, which did not store where frames begin; "
+            f"the recordings of {clip.event_id!r} are of an earlier release, which did not store where frames begin; "
             "locate them with `livessl locate --wav ARRAY=FILE`"
         )
     try:
-        return _parsed(about)
+        return _parsed(clip)
     except _UNREADABLE as error:
         what = f"{error} is missing" if isinstance(error, KeyError) else str(error)
-        raise RelocationError(
-            f"event {event_id!r}: expected a {ABOUT} that this release can read, got another one: {what}; it is "
-            "damaged or of another release: locate its sound with `livessl locate --wav ARRAY=FILE`, or delete them"
-        ) from error
+        raise RelocationError(str(UnreadableClipError(clip.event_id, what))) from error
 
 
 def check_memory(sound: StoredSound, most_bytes: int) -> None:
@@ -151,7 +178,7 @@ def check_memory(sound: StoredSound, most_bytes: int) -> None:
         )
 
 
-def stored_frames(folder: ClipReader, event_id: str, array: StoredArray) -> list[Frame]:
+def stored_frames(sound: StoredSound, array: StoredArray) -> list[Frame]:
     """Return the frames of one array of a clip.
 
     Raises
@@ -161,7 +188,7 @@ def stored_frames(folder: ClipReader, event_id: str, array: StoredArray) -> list
     RelocationError
         If it cannot be read, or is another than `clip.json` describes.
     """
-    path = folder.file(event_id, array.file)
+    event_id, path = sound.event_id, sound.clip.file(array.file)
     if path is None:
         raise NoClipError(f"event {event_id!r}: its recording {array.file!r} is gone; it cannot be located again")
     try:
@@ -208,15 +235,15 @@ def _samples(path: Path, array: StoredArray) -> Float32Array:
     return found
 
 
-def _parsed(about: Mapping[str, Any]) -> StoredSound:
+def _parsed(clip: Clip) -> StoredSound:
     """Return the content of a `clip.json`; raises one of `_UNREADABLE` if something is missing or has another form."""
-    files = {str(each["array"]): str(each["name"]) for each in about["files"] if each["kind"] == "array"}
+    about = clip.content
+    files = {str(each["array"]): each["name"] for each in clip.files if each["kind"] == "array"}
     arrays = about["arrays"]
     found = StoredSound(
-        str(about["event_id"]),
-        int(about["start_ns"]),
+        clip,
         _positive("duration_s", about["duration_s"]),
-        _positive("c_m_s", about["c_m_s"]),
+        _within("c_m_s", about["c_m_s"], _SPEEDS_M_S),
         _answer(about["answer"]),
         tuple(_array(str(name), known, files[name]) for name, known in arrays.items()),
     )
@@ -245,18 +272,18 @@ def _answer(answer: Mapping[str, Any]) -> Mapping[str, Any]:
 
 def _array(name: str, known: Mapping[str, Any], file: str) -> StoredArray:
     microphones_m = np.array(known["microphones_m"], dtype=np.float64)
-    if microphones_m.shape[1:] != (3,) or not np.isfinite(microphones_m).all():
+    if microphones_m.shape[1:] != (3,) or not (np.abs(microphones_m) <= _MOST_M).all():
         raise ValueError(f"arrays.{name}.microphones_m: expected positions (K, 3), got {known['microphones_m']!r}")
     uncertainty = Uncertainty(**known["uncertainty"])
-    for value in known["uncertainty"].values():
-        float(value)
+    for what, value in known["uncertainty"].items():
+        _within(f"arrays.{name}.uncertainty.{what}", value, (0.0, _MOST_UNCERTAINTY))
     return StoredArray(
         name,
         file,
         microphones_m,
         uncertainty,
         int(known["time_ns"]),
-        _positive(f"arrays.{name}.sample_rate_hz", known["sample_rate_hz"]),
+        _within(f"arrays.{name}.sample_rate_hz", known["sample_rate_hz"], _RATES_HZ),
         tuple(_row(name, row) for row in known["frames"]),
     )
 
@@ -267,6 +294,13 @@ def _row(name: str, row: Sequence[Any]) -> CutFrame:
     if found.begin < 0 or found.length <= 0:
         raise ValueError(f"arrays.{name}.frames: expected a begin of 0 or more and a length above 0, got {row!r}")
     return found
+
+
+def _within(what: str, value: Any, limits: tuple[float, float]) -> float:
+    low, high = limits
+    if not isinstance(value, int | float) or not low <= value <= high:
+        raise ValueError(f"{what}: expected a number from {low:g} to {high:g}, got {value!r}")
+    return float(value)
 
 
 def _positive(what: str, value: Any) -> float:

@@ -18,9 +18,10 @@ from typing import TYPE_CHECKING, Final
 import orjson
 
 from livessl import __version__
-from livessl.clock import Clock, utc_ns, utc_text
+from livessl.clock import Clock, utc_text
 from livessl.server.api.encode import API_VERSION, JsonObject
-from livessl.server.forwarding.outbox import Outbox, Outgoing, Unsent
+from livessl.server.forwarding.hub_messages import HubMessages
+from livessl.server.forwarding.outbox import Outbox, Unsent
 from livessl.server.forwarding.stream import (
     HEALTH,
     MESSAGE_ID,
@@ -34,7 +35,7 @@ from livessl.server.forwarding.stream import (
     subject,
     until_one_ends,
 )
-from livessl.server.history.backlog import Backlog, Write
+from livessl.server.history.backlog import Backlog
 from livessl.server.history.database import StoreError
 from livessl.site.models import Site
 
@@ -70,9 +71,7 @@ _log = logging.getLogger(__name__)
 
 
 class HubLink:
-    """Forwards results to the hub.
-
-    Every thread may call `take`; messages of replays are to be kept from it.
+    """Sends what waits in the outbox to the hub's stream, and reports on the site.
 
     Parameters
     ----------
@@ -102,10 +101,9 @@ class HubLink:
         self._location_deg = config.location_deg
         self._clock = clock
         self._outbox = outbox
-        self._backlog = backlog
+        self.messages = HubMessages(clock, outbox, backlog)
+        """Puts messages into the outbox."""
         self._arrays = arrays
-        self._states: dict[str, tuple[str, str | None]] = {}
-        self._sending = threading.Lock()
         self._loop: asyncio.AbstractEventLoop | None = None
         self._thread: threading.Thread | None = None
         self._news, self._end = asyncio.Event(), asyncio.Event()
@@ -128,29 +126,9 @@ class HubLink:
             return None
         return f"{PLACE}: {self._problem}; {self.waiting} messages wait for the hub"
 
-    def take(self, message: JsonObject) -> None:
-        """Take in a message for subscribers; what a hub needs of it is put into the outbox.
-
-        Of tracks these are the beginning and the end, of arrays the changes of their states. Final events come to the
-        outbox by the store.
-        """
-        match message["kind"]:
-            case "alert":
-                self.take_alerts([message])
-            case "track" if message["state"] != "update" and message["time_utc"] is not None:
-                self._put([Outgoing("track", utc_ns(message["time_utc"]), message)])
-            case "arrays":
-                self._take_arrays(message)
-
-    def take_alerts(self, messages: Sequence[JsonObject]) -> None:
-        """Put alerts into the outbox; those that the hub has do no harm."""
-        if messages:
-            self._put([Outgoing("alert", utc_ns(message["raised_utc"]), message) for message in messages])
-
     def start(self) -> None:
         """Begin to send."""
-        now_ns = self._clock.now_ns()
-        self._put([Outgoing("start", now_ns, {"kind": "start", "time_utc": utc_text(now_ns), "version": __version__})])
+        self.messages.note_start()
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._run, args=(self._loop,), name="hub", daemon=True)
         self._thread.start()
@@ -161,39 +139,6 @@ class HubLink:
         if self._thread is not None:
             self._call(self._end.set)
             self._thread.join(timeout=STOP_S)
-
-    def _take_arrays(self, message: JsonObject) -> None:
-        """Put the arrays whose state or its reason has changed into the outbox."""
-        changed = []
-        with self._sending:
-            for array in message["arrays"]:
-                state = array["state"], array["reason"]
-                if self._states.get(array["name"]) != state:
-                    self._states[array["name"]] = state
-                    changed.append(array)
-        if changed:
-            time_ns = utc_ns(message["now_utc"])
-            fields = ("name", "state", "reason", "node", "enabled")
-            self._put(
-                [
-                    Outgoing(
-                        "array",
-                        time_ns,
-                        {"kind": "array", "time_utc": message["now_utc"], **{name: array[name] for name in fields}},
-                    )
-                    for array in changed
-                ]
-            )
-
-    def _put(self, messages: Sequence[Outgoing]) -> None:
-        rows = [(kind, time_ns, orjson.dumps(message)) for kind, time_ns, message in messages]
-
-        def store() -> None:
-            self._outbox.put([Outgoing(kind, time_ns, orjson.loads(body)) for kind, time_ns, body in rows])
-
-        nbytes = sum(len(body) for *_, body in rows)  # as bytes: thousands may wait for a database
-        write = Write(store, 0, is_final=False, others=len(rows), nbytes=nbytes)
-        self._backlog.put(write, self._clock.monotonic_ns())
 
     # --- the thread
 

@@ -89,6 +89,27 @@ class Outbox:
         connection.execute(update(outbox_head).values(last=last))
         connection.execute(delete(outbox).where(outbox.c.number <= last - MAX_UNSENT))
 
+    def put_final_with(
+        self,
+        connection: Connection,
+        found: Sequence[tuple[JsonObject, int]],
+        kept: Sequence[tuple[JsonObject, int]],
+    ) -> None:
+        """Append events that have become final, in order of time; see `put_with`.
+
+        Parameters
+        ----------
+        connection : Connection
+        found : sequence of (JsonObject, int)
+            Events that the final pass found, each with its start in nanoseconds.
+        kept : sequence of (JsonObject, int)
+            Early events that are final as they are, unless one of `found` has the same id.
+        """
+        known = {event["id"] for event, _ in found}
+        final = [*found, *((event, time_ns) for event, time_ns in kept if event["id"] not in known)]
+        final.sort(key=lambda each: each[1])
+        self.put_with(connection, [Outgoing("event", time_ns, event) for event, time_ns in final])
+
     def rename(self) -> None:
         """Give the outbox a new name, under which all messages are sent that wait now.
 

@@ -138,9 +138,7 @@ async def connected(
     lost : callable
         Called when the connection is lost.
     """
-    client: Client = nats.NATS()
-    if "tls" in options:
-        _insist_on_tls(client, nats)
+    client: Client = _encrypting_client(nats) if "tls" in options else nats.NATS()
     try:
         await client.connect(**options, error_cb=failed, disconnected_cb=lost)
         yield client
@@ -184,21 +182,24 @@ async def ended(*tasks: asyncio.Task[Any]) -> None:
         raise cancelled
 
 
-def _insist_on_tls(client: Any, nats: Any) -> None:
-    """Have a client end a connection whose server offers no TLS, before it sends its user and password.
+def _encrypting_client(nats: Any) -> Client:
+    """Return a client that ends a connection whose server offers no TLS, before it sends its user and password.
 
     The library starts TLS only if the first line of the server, which anyone on the way can change, asks for it.
     """
-    greeting = client._connect_command
 
-    def encrypted_greeting() -> bytes:
-        url = client._current_server.uri
-        if url.scheme == "tls" and client._transport._io_writer.get_extra_info("ssl_object") is None:
-            raise nats.errors.Error(f"{url.netloc} offers no TLS; set tls in its nats.conf, or see who answers there")
-        text: bytes = greeting()
-        return text
+    class EncryptingClient(nats.NATS):  # type: ignore[misc]
+        def _connect_command(self) -> bytes:
+            """Return what a client sends first, which has its user and password."""
+            url = self._current_server.uri
+            if url.scheme == "tls" and self._transport._io_writer.get_extra_info("ssl_object") is None:
+                cure = "set tls in its nats.conf, or see who answers there"
+                raise nats.errors.Error(f"{url.netloc} offers no TLS; {cure}")
+            text: bytes = super()._connect_command()
+            return text
 
-    client._connect_command = encrypted_greeting
+    client: Client = EncryptingClient()
+    return client
 
 
 def _token(site: str) -> str:

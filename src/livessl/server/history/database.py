@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import logging
 import sqlite3
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -66,6 +67,8 @@ NARROW: Final = "narrow the span of time that is searched"
 
 CURE_OF_SERVER: Final = "see that PostgreSQL runs, has space, and admits this user"
 """Cure of a PostgreSQL database that cannot be used."""
+
+_log = logging.getLogger(__name__)
 
 
 class StoreError(RunError):
@@ -307,6 +310,7 @@ def _migrate(connection: Connection) -> None:
                 f"server.events_db: expected a database of revision {HEAD} or before, got {revision} of a newer "
                 "livessl; update livessl, or name another database"
             )
+        _log.info("server.events_db: migrating the database from revision %s to %s", revision, HEAD)
     upgrade(connection)
 
 

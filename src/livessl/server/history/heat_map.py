@@ -58,18 +58,18 @@ def count_by_cell(connection: Connection, query: Query, cells: Cells) -> HeatMap
 
     Those on the last edges are in the last cells. The pages of the query do not matter.
     """
-    places = [events.c.x_mm, events.c.y_mm]
+    places, (nx, ny) = (events.c.x_mm, events.c.y_mm), cells.shape
     limits = zip(places, cells.low_mm, cells.high_mm, strict=True)
     is_inside = and_(*(place.between(low, high) for place, low, high in limits))
-    indices = [
-        case((is_inside, (place - low) // cells.spacing_mm), else_=None)
-        for place, low in zip(places, cells.low_mm, strict=True)
-    ]
-    statement, _ = matching(query, *indices, func.count())
+    i, k = ((place - low) // cells.spacing_mm for place, low in zip(places, cells.low_mm, strict=True))
+    # one number for row and column: most of the time goes into sorting by it
+    cell = case((is_inside, i * (ny + 1) + k), else_=None)
+    statement, _ = matching(query, cell, func.count())
     counts, elsewhere = np.zeros(cells.shape, dtype=np.int64), 0
-    for i, j, count in connection.execute(statement.group_by(text("1"), text("2"))):
-        if i is None:
+    for number, count in connection.execute(statement.group_by(text("1"))):
+        if number is None:
             elsewhere += count
         else:
-            counts[min(i, cells.shape[0] - 1), min(j, cells.shape[1] - 1)] += count
+            row, column = divmod(number, ny + 1)
+            counts[min(row, nx - 1), min(column, ny - 1)] += count
     return HeatMap(counts, elsewhere)

@@ -1,4 +1,4 @@
-"""The statements that write into the history, on a connection whose transaction the caller ends."""
+"""The statements that write events, and that find those which may change, in a transaction that the caller ends."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from sqlalchemy import Connection, delete, func, insert, select
 
 from livessl.core.types import FRAME_NS
 from livessl.server.history.query import JsonObject
-from livessl.server.history.tables import disabled, early, event_row, events, life, progress, tag_rows, tags
+from livessl.server.history.tables import early, event_row, events, life, tag_rows, tags
 
 _INSERT_EVENT = insert(events)
 _INSERT_TAG = insert(tags)
@@ -104,23 +104,20 @@ def end_early(connection: Connection, frame_index: int) -> list[tuple[JsonObject
     return [(orjson.loads(body), time_ns) for time_ns, body in connection.execute(query)]
 
 
+def count_events(connection: Connection) -> int:
+    """Return the number of events; a large database reads all of an index for it."""
+    return int(connection.execute(select(func.count()).select_from(events)).scalar_one())
+
+
 def early_ids(connection: Connection) -> list[str]:
     """Return the ids of early events: few. A join would have PostgreSQL read all events, as it knows no better."""
     return list(connection.execute(select(early.c.id)).scalars())
 
 
-def put_progress(connection: Connection, site: str, frame_index: int, clocks: JsonObject) -> None:
-    """Note how far the final pass of a site has come, and what was known of its clocks."""
-    connection.execute(delete(progress).where(progress.c.site == site))
-    text = orjson.dumps(clocks).decode()
-    connection.execute(insert(progress), {"site": site, "frame_index": frame_index, "clocks": text})
-
-
-def put_disabled(connection: Connection, site: str, array: str, *, is_disabled: bool) -> None:
-    """Note whether an array is disabled."""
-    connection.execute(delete(disabled).where(disabled.c.site == site, disabled.c.array == array))
-    if is_disabled:
-        connection.execute(insert(disabled), {"site": site, "array": array})
+def early_events(connection: Connection) -> list[tuple[int, JsonObject]]:
+    """Return the early events, oldest first, each with its start in nanoseconds of site time."""
+    query = select(events.c.time_ns, events.c.body).where(events.c.id.in_(early_ids(connection)))
+    return [(time_ns, orjson.loads(body)) for time_ns, body in connection.execute(query.order_by(events.c.time_ns))]
 
 
 class _Stored(NamedTuple):

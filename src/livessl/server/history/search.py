@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from sqlalchemy import ColumnElement, FromClause, Select, Tuple, and_, exists, literal, select, tuple_
+from sqlalchemy import ColumnElement, Connection, FromClause, Select, Tuple, and_, exists, literal, select, tuple_
 
-from livessl.server.history.query import Cursor, Query
+from livessl.server.history.query import Cursor, Page, Query, Row
 from livessl.server.history.tables import events, tags
 
 
@@ -56,7 +56,18 @@ def _is_tagged(searched: FromClause, kind: str, name: str) -> ColumnElement[bool
     return exists().where(and_(*here, other.c.number == searched.c.number))
 
 
-def page_statement(query: Query, most: int) -> Select[Any]:
+def event_page(connection: Connection, query: Query) -> Page:
+    """Return a page of the events that a query admits, with the cursors of its neighbours."""
+    found = connection.execute(_page_statement(query, query.limit + 1)).all()
+    rows = [Row(*row) for row in found[: query.limit]]
+    has_more = len(found) > query.limit
+    if query.after is not None:
+        rows.reverse()
+        return Page(rows, rows[-1].cursor if rows else None, rows[0].cursor if rows else query.after)
+    return Page(rows, rows[-1].cursor if has_more else None, rows[0].cursor if rows else None)
+
+
+def _page_statement(query: Query, most: int) -> Select[Any]:
     """Return the statement for a page of at most so many events: time, number and JSON.
 
     They come newest first, or oldest first if the query wants this or names the event after which the page begins.

@@ -34,7 +34,7 @@ metadata: Final = MetaData(
 )
 """All tables of the history."""
 
-ROW_NUMBER: Final = BigInteger().with_variant(Integer(), "sqlite")  # of SQLite's integers, only INTEGER counts up
+ROW_NUMBER: Final = BigInteger().with_variant(Integer(), "sqlite")  # SQLite numbers rows in INTEGER columns only
 
 events: Final = Table(
     "events",
@@ -54,7 +54,7 @@ events: Final = Table(
     UniqueConstraint("id"),
     sqlite_autoincrement=True,
 )
-"""Events. `words` is what a text is searched in, in lower case; `body` is the event's JSON."""
+"""Events. `words` is the text that searches look through, in lower case; `body` is the event's JSON."""
 
 Index(
     "events_time",
@@ -74,15 +74,15 @@ tags: Final = Table(
     PrimaryKeyConstraint("kind", "name", "time_ns", "number"),
     sqlite_with_rowid=False,
 )
-"""Zones, arrays and flags of the events, and at a hub their sites: rows of kind `zone`, `array`, `flag` and `site`,
-with what a search compares besides. The only flag is `excluded`."""
+"""Zones, arrays and flags of the events, and in a hub their sites: one row for each, of the kind `zone`, `array`,
+`flag` or `site`. The other columns repeat those of the event that a search compares. The only flag is `excluded`."""
 
 Index("event_tags_number", tags.c.number)
 Index(
     "event_tags_search",
     *(tags.c[name] for name in ("kind", "name", "time_ns", "number")),
     postgresql_include=["confidence", "status", "level_dbfs"],
-).ddl_if(dialect="postgresql")  # SQLite keeps the rows in the order of the key, with all that is compared
+).ddl_if(dialect="postgresql")  # SQLite needs no index: it keeps whole rows in the order of the key
 
 early: Final = Table("early", metadata, Column("id", String, nullable=False), PrimaryKeyConstraint("id"))
 """Ids of events that a final pass may still replace."""
@@ -121,8 +121,8 @@ journal: Final = Table(
     UniqueConstraint("key"),
     sqlite_autoincrement=True,
 )
-"""Alerts, tracks, and changes of arrays and of the configuration: see `history.journal`. `words` is what a text is
-searched in, in lower case; `body` is the JSON of the details."""
+"""Alerts, tracks, and changes of arrays and of the configuration: see `history.journal`. `words` is the text that
+searches look through, in lower case; `body` is the JSON of the details."""
 
 Index("journal_time", journal.c.time_ns, journal.c.number)
 Index("journal_kind", journal.c.kind, journal.c.time_ns, journal.c.number)
@@ -134,8 +134,8 @@ life: Final = Table(
     Column("number", BigInteger, autoincrement=False, nullable=False),
     PrimaryKeyConstraint("number"),
 )
-"""One row: a random number, drawn when the tables are made. Positions in the log name it, so that those of a history
-that was replaced are recognized."""
+"""One row: a random number, drawn when the tables are made. Positions in the log contain it, so that positions of a
+history that was replaced are recognized."""
 
 
 def event_row(event: JsonObject, time_ns: int) -> dict[str, Any]:

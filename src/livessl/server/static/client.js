@@ -67,6 +67,8 @@ class Follower {
     const given = { kinds: kinds?.join(","), zone, min_confidence: minConfidence, track, max_rate_hz: maxRateHz };
     for (const [name, value] of Object.entries(given)) if (value !== undefined) query.set(name, value);
     if (this.lastSeq !== null) query.set("since_seq", this.lastSeq);
+    if (globalThis.WebSocket === undefined)
+      throw new Error("expected a browser or Node.js 22 or newer, which have WebSocket, got an older one");
     const protocols = token === undefined ? [] : ["livessl", `livessl.token.${token}`];
     const socket = new WebSocket(`${this.url.replace(/^http/, "ws")}/api/v1/live?${query}`, protocols);
     this.socket = socket;
@@ -74,12 +76,16 @@ class Follower {
     this.openedMs = null;
     this.nextReadMs = 0;
     socket.onmessage = ({ data }) => this.then(socket, () => this.take(JSON.parse(data)));
-    socket.onclose = ({ code, reason }) => {
-      if (socket !== this.socket) return;
+    let hasEnded = false;
+    const end = ({ code, reason }) => {
+      if (socket !== this.socket || hasEnded) return;
+      hasEnded = true;
       if (code === POLICY_VIOLATION) this.refuse(reason);
       else if (this.openedMs === null) this.explain(socket);
       else this.drop(socket, new Error("the connection was lost"));
     };
+    socket.onclose = end;
+    socket.onerror = () => setTimeout(end, 0, {}); // before the close in browsers; some versions of Node.js close nothing
   }
 
   /** Carry a step out after those before, unless the connection is another one by then. */

@@ -38,6 +38,7 @@ export class Clips {
     section.dataset.state = found?.state ?? "unknown";
     if (found?.state === "stored") this.#fill(found, section);
     else if (found?.state === "waiting") section.replaceChildren(el("p", { className: "clip-note", text: "Recordings are being made…" }));
+    else if (found?.state === "unreadable") this.#explain(found, section);
     else section.replaceChildren();
     const again = found === null || found.state === "waiting";
     if (again && attempts > 1) setTimeout(() => section.isConnected && this.#load(id, section, attempts - 1), RETRY_MS);
@@ -53,6 +54,14 @@ export class Clips {
         : el("p", { className: "clip-note", text: "Sign in as an operator to listen." }));
     const form = this.mayListen ? this.relocate.form(found) : null;
     if (form !== null) section.append(form);
+  }
+
+  /** Why the recordings cannot be read; operators can delete them. */
+  #explain({ event_id: id, problem }, section) {
+    section.replaceChildren(
+      el("h3", { text: "Recordings" }),
+      el("p", { className: "clip-note", "data-testid": "clip-problem", text: `The recordings cannot be read. ${problem}.` }),
+      this.mayListen ? el("p", { className: "clip-tools" }, this.#deletion(id, section)) : "");
   }
 
   #item(id, file) {
@@ -83,12 +92,15 @@ export class Clips {
       reload();
     });
     kept.setAttribute("aria-pressed", String(keep));
-    const gone = this.#button("Delete", "Delete the recordings", async () => {
+    return el("p", { className: "clip-tools" }, kept, this.#deletion(id, section));
+  }
+
+  #deletion(id, section) {
+    return this.#button("Delete", "Delete the recordings", async () => {
       if (!confirm("Delete the recordings of this event? The event itself stays.")) return;
       await check(await remove(this.#url(id)));
-      reload();
+      this.#load(id, section, 1);
     });
-    return el("p", { className: "clip-tools" }, kept, gone);
   }
 
   /** A button that does something that takes time; while it does, and after it has failed, the button says so. */
