@@ -7,6 +7,7 @@ import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from livessl.cli import argument, progress
@@ -23,10 +24,10 @@ from livessl.cli.exits import FAILED, OK
 from livessl.cli.options import add_calibration_file, add_json, read_site
 from livessl.cli.output import complain, print_warnings
 from livessl.cli.server_answers import add_server
-from livessl.errors import ConfigError, UseError
+from livessl.errors import ConfigError, UseError, did_you_mean
 
 if TYPE_CHECKING:
-    from livessl.calibration import Clap, HeardSound
+    from livessl.calibration import Clap, HeardSound, KnownSound
     from livessl.cli.server_sounds import ServerSounds
     from livessl.core.commission.resection import MeasuredSetUp
     from livessl.recordings.assign import AssignedRecording
@@ -59,6 +60,7 @@ def _add_verify(actions: Any) -> None:
         "verify --site site.yaml --at 2,3,1.2 --at 6,8,1.2",
     )
     _add_places(sub, "place of a clap in metres; repeat for each, in the order in which they are made")
+    _add_truth(sub)
     add_json(sub, "print one JSON object for each clap and each finding")
 
 
@@ -74,6 +76,7 @@ def _add_poses(actions: Any) -> None:
         sub,
         "place of a clap in metres; repeat for each clap. With a running server --at is optional: places are proposed",
     )
+    _add_truth(sub)
     sub.add_argument(
         "--place-std",
         type=argument.above_zero,
@@ -144,6 +147,15 @@ def _add_places(parser: Any, text: str) -> None:
     parser.add_argument("--at", action="append", type=argument.place, default=[], metavar="X,Y,Z", help=text)
 
 
+def _add_truth(parser: Any) -> None:
+    parser.add_argument(
+        "--truth",
+        type=Path,
+        metavar="FILE",
+        help="truth.jsonl of a simulated session, which has the places and times of its sounds, instead of --at",
+    )
+
+
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
     from livessl.calibration import MOST_CLAPS
@@ -173,6 +185,10 @@ def _server_of_file(arguments: argparse.Namespace) -> str | None:
 def _is_live(arguments: argparse.Namespace) -> bool:
     """Return whether a running server is meant: --url, or --site without recordings."""
     recorded = bool(arguments.session or arguments.wav)
+    if not recorded and arguments.channels:
+        raise UseError("calibrate: --channels names channels of the files of --wav, and none is given; remove it")
+    if not recorded and getattr(arguments, "truth", None) is not None:
+        raise UseError("calibrate: --truth belongs to a simulated session; give the session as --session DIR")
     if arguments.url and recorded:
         raise UseError(
             "calibrate: expected a running server (--url) or recordings (--session, --wav); give one of them"
@@ -233,17 +249,36 @@ def _recorded(arguments: argparse.Namespace) -> tuple[Site, list[HeardSound], Se
 def _recorded_claps(arguments: argparse.Namespace) -> tuple[Site, list[Clap]]:
     import numpy as np
 
-    from livessl.calibration import claps_of
+    from livessl.calibration import claps_by_time, claps_of
 
+    if arguments.truth is not None:
+        known = _truth(arguments)
+        site, sounds, parts = _recorded(arguments)
+        return site, claps_by_time(sounds, known, min(part.start_ns for part in parts) / 1e9)
     _require_places(arguments)
     site, sounds, _ = _recorded(arguments)
     _require_inside(site, arguments)
     return site, claps_of(sounds, np.array(arguments.at))
 
 
+def _truth(arguments: argparse.Namespace) -> list[KnownSound]:
+    from livessl.calibration import MOST_CLAPS
+    from livessl.cli.truth_file import read_truth
+
+    if arguments.at:
+        raise UseError("calibrate: expected the places by --at or by --truth, got both; remove one of them")
+    known = read_truth(arguments.truth)
+    if len(known) > MOST_CLAPS:
+        raise UseError(f"--truth: expected {MOST_CLAPS} sounds at most, got {len(known)}; simulate fewer with --count")
+    return known
+
+
 def _require_places(arguments: argparse.Namespace) -> None:
     if not arguments.at:
-        raise UseError("calibrate: expected --at X,Y,Z for each clap, got none; give the places in metres")
+        raise UseError(
+            "calibrate: expected --at X,Y,Z for each clap, got none; give the places in metres, or --truth "
+            "SESSION/truth.jsonl for a simulated session"
+        )
 
 
 def _require_inside(site: Site, arguments: argparse.Namespace) -> None:
@@ -264,7 +299,8 @@ def _verify(arguments: argparse.Namespace) -> int:
     def show(clap: Clap) -> None:
         print(json.dumps(clap_object(clap)) if arguments.json else clap_line(clap), flush=True)
 
-    _require_places(arguments)
+    if arguments.truth is None:
+        _require_places(arguments)
     if _is_live(arguments):
         from livessl.cli.guided import claps_at
 
@@ -326,7 +362,10 @@ def _refine(arguments: argparse.Namespace) -> int:
     names = [spec.name for spec in site.processed]
     stranger = next((name for name in arguments.known if name not in names), None)
     if stranger is not None:
-        raise UseError(f"--known: expected an array of the site ({', '.join(names)}), got {stranger!r}")
+        raise UseError(
+            f"--known: expected an array of the site ({', '.join(names)}), got {stranger!r}"
+            f"{did_you_mean(stranger, names)}"
+        )
     known = arguments.known or names[:1]
     if not arguments.known:
         complain(f"{known[0]!r} is taken to be where the site file says; --known ARRAY names another", kind="note")

@@ -66,6 +66,21 @@ class Session:
         """Return the site of the recording, with the joint arrays of `joint` in addition to its own."""
         return load_site(self.directory / SITE_FILE, joint)
 
+    def inputs(self) -> dict[str, list[int]]:
+        """Return the inputs of the device that were recorded, by array, in the order of the channels of its files.
+
+        Arrays without a node are left out, and all arrays if the session's site file cannot be read.
+        """
+        try:
+            data = read_yaml((self.directory / SITE_FILE).read_text(encoding="utf-8"))
+            return {
+                str(name): [int(number) for number in numbers]
+                for node in data.get("nodes", {}).values()
+                for name, numbers in node.get("arrays", {}).items()
+            }
+        except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError, AttributeError, TypeError, ValueError):
+            return {}
+
 
 def piece(array: str, file: str, start_ns: int) -> Piece:
     """Return a piece that begins at a site time."""
