@@ -7,7 +7,6 @@ import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from livessl.cli import argument, progress
@@ -24,10 +23,11 @@ from livessl.cli.exits import FAILED, OK
 from livessl.cli.options import add_calibration_file, add_json, read_site
 from livessl.cli.output import complain, print_warnings
 from livessl.cli.server_answers import add_server
+from livessl.cli.truth_file import add_truth, truth_given
 from livessl.errors import ConfigError, UseError, did_you_mean
 
 if TYPE_CHECKING:
-    from livessl.calibration import Clap, HeardSound, KnownSound
+    from livessl.calibration import Clap, HeardSound
     from livessl.cli.server_sounds import ServerSounds
     from livessl.core.commission.resection import MeasuredSetUp
     from livessl.recordings.assign import AssignedRecording
@@ -60,7 +60,7 @@ def _add_verify(actions: Any) -> None:
         "verify --site site.yaml --at 2,3,1.2 --at 6,8,1.2",
     )
     _add_places(sub, "place of a clap in metres; repeat for each, in the order in which they are made")
-    _add_truth(sub)
+    add_truth(sub)
     add_json(sub, "print one JSON object for each clap and each finding")
 
 
@@ -76,7 +76,7 @@ def _add_poses(actions: Any) -> None:
         sub,
         "place of a clap in metres; repeat for each clap. With a running server --at is optional: places are proposed",
     )
-    _add_truth(sub)
+    add_truth(sub)
     sub.add_argument(
         "--place-std",
         type=argument.above_zero,
@@ -145,15 +145,6 @@ def _action(actions: Any, name: str, act: Callable[[argparse.Namespace], int], t
 
 def _add_places(parser: Any, text: str) -> None:
     parser.add_argument("--at", action="append", type=argument.place, default=[], metavar="X,Y,Z", help=text)
-
-
-def _add_truth(parser: Any) -> None:
-    parser.add_argument(
-        "--truth",
-        type=Path,
-        metavar="FILE",
-        help="truth.jsonl of a simulated session, which has the places and times of its sounds, instead of --at",
-    )
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -252,25 +243,13 @@ def _recorded_claps(arguments: argparse.Namespace) -> tuple[Site, list[Clap]]:
     from livessl.calibration import claps_by_time, claps_of
 
     if arguments.truth is not None:
-        known = _truth(arguments)
+        known = truth_given(arguments)
         site, sounds, parts = _recorded(arguments)
         return site, claps_by_time(sounds, known, min(part.start_ns for part in parts) / 1e9)
     _require_places(arguments)
     site, sounds, _ = _recorded(arguments)
     _require_inside(site, arguments)
     return site, claps_of(sounds, np.array(arguments.at))
-
-
-def _truth(arguments: argparse.Namespace) -> list[KnownSound]:
-    from livessl.calibration import MOST_CLAPS
-    from livessl.cli.truth_file import read_truth
-
-    if arguments.at:
-        raise UseError("calibrate: expected the places by --at or by --truth, got both; remove one of them")
-    known = read_truth(arguments.truth)
-    if len(known) > MOST_CLAPS:
-        raise UseError(f"--truth: expected {MOST_CLAPS} sounds at most, got {len(known)}; simulate fewer with --count")
-    return known
 
 
 def _require_places(arguments: argparse.Namespace) -> None:

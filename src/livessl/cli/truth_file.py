@@ -2,14 +2,43 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from livessl.errors import UseError
 
 if TYPE_CHECKING:
     from livessl.calibration import KnownSound
+
+
+def add_truth(parser: Any) -> None:
+    """Add --truth, which `truth_given` reads."""
+    parser.add_argument(
+        "--truth",
+        type=Path,
+        metavar="FILE",
+        help="truth.jsonl of a simulated session, which has the places and times of its sounds, instead of --at",
+    )
+
+
+def truth_given(arguments: argparse.Namespace) -> list[KnownSound]:
+    """Return the sounds of the file that --truth names.
+
+    Raises
+    ------
+    UseError
+        As `read_truth`, and if places are given by --at, too.
+    """
+    from livessl.calibration import MOST_CLAPS
+
+    if arguments.at:
+        raise UseError("calibrate: expected the places by --at or by --truth, got both; remove one of them")
+    known = read_truth(arguments.truth)
+    if len(known) > MOST_CLAPS:
+        raise UseError(f"--truth: expected {MOST_CLAPS} sounds at most, got {len(known)}; simulate fewer with --count")
+    return known
 
 
 def read_truth(path: Path) -> list[KnownSound]:

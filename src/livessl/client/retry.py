@@ -6,7 +6,7 @@ import logging
 import random
 from typing import Final
 
-from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus, InvalidURI, WebSocketException
+from websockets.exceptions import ConnectionClosed, InvalidMessage, InvalidStatus, InvalidURI, WebSocketException
 
 from livessl.client.address import Address, RefusedError, may_pass
 from livessl.clock import SystemClock
@@ -127,6 +127,6 @@ class Patience:
 def _hint(error: Exception) -> str:
     """Return what to check if something listens at the address, and does not answer as a web server does."""
     is_silent = isinstance(error, TimeoutError) and error.errno is None  # others come from the network
-    if not (is_silent or isinstance(error, InvalidHandshake)):
+    if not (is_silent or isinstance(error, InvalidMessage)):
         return ""
     return ". Check the port: that of the dashboard (server.http) is needed, not that of the nodes (server.bind)"
