@@ -5,13 +5,16 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from cli.command_runs import Recorded, Run, simulate_arguments
-from livessl.cli.main import main
 from livessl.cli.own_work import is_own_picture
 from livessl.cli.relocate import BEGINNING, is_begun
+from livessl.lab.evaluate.campaign import run_campaign
+from livessl.lab.evaluate.report import write_report
 from small_site import write_site
 
 COMMENTED = "# measured by hand, keep\n"
@@ -142,7 +145,7 @@ def test_a_picture_of_our_own_is_drawn_again(run: Run, tmp_path: Path) -> None:
 def test_a_calibration_replaces_nothing_else(run: Run, recorded: Recorded, tmp_path: Path, text: str) -> None:
     """Neither the file that is named nor the one at the usual place, which may be a geometry."""
     site = write_site(tmp_path)
-    usual = tmp_path / "calibration" / "lab.yaml"
+    usual = tmp_path / "calibration" / "small.yaml"
     usual.parent.mkdir()
     for path, given in ((tmp_path / "other.yaml", ["--write", tmp_path / "other.yaml"]), (usual, ["--write"])):
         path.write_text(text, encoding="utf-8")
@@ -151,15 +154,23 @@ def test_a_calibration_replaces_nothing_else(run: Run, recorded: Recorded, tmp_p
         assert path.read_text(encoding="utf-8") == text
 
 
-@pytest.mark.parametrize("name", ["report.md", "summary.csv", "figures/room.png", "campaign.json"])
-def test_a_report_refuses_files_of_others(tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("name", ["report.md", "summary.csv", "figures/room.png"])
+def test_a_report_refuses_files_of_others(tmp_path: Path, name: str) -> None:
     path = tmp_path / name
     path.parent.mkdir(exist_ok=True)
     path.write_text("# My own\n", encoding="utf-8")
-    if name != "campaign.json":
-        assert main(["evaluate", "report", "--with", str(tmp_path / "none"), "--out", str(tmp_path)]) == 2
-        assert name.partition("/")[0] in capsys.readouterr().err
-    assert path.read_text(encoding="utf-8") == "# My own\n"
+    with pytest.raises(ValueError, match=name.partition("/")[0]):
+        write_report(tmp_path, [tmp_path / "none"])
+    assert contents(tmp_path) == {name: b"# My own\n"}
+
+
+@pytest.mark.parametrize("name", ["results.parquet", "report.md", "campaign.json", "cost.jsonl"])
+def test_a_campaign_refuses_files_of_others(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_text("# My own\n", encoding="utf-8")
+    job: Any = SimpleNamespace(digest="0")
+    with pytest.raises(ValueError, match=r"expected .*empty folder"):
+        run_campaign(job, tmp_path, jobs=1)
+    assert contents(tmp_path) == {name: b"# My own\n"}
 
 
 @pytest.mark.parametrize("length", range(0, len(BEGINNING) + 9, 5))
