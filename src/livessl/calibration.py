@@ -26,6 +26,11 @@ from livessl.site.models import Site
 MOST_CLAPS: Final = 64
 """Most known places of one calibration; a longer list is a mistake."""
 
+SAME_S: Final = 0.3
+"""Largest difference, in seconds, between the starts of a simulated sound and of the sound that was located.
+
+Half of the pause between two sounds is longer; a frame and the travel of sound are shorter."""
+
 
 @dataclass(frozen=True, slots=True)
 class HeardSound:
@@ -100,6 +105,50 @@ def claps_of(sounds: Sequence[HeardSound], places_m: FloatArray) -> list[Clap]:
             "record the claps again with nothing else audible, or correct --at"
         )
     return [Clap(place_m, sound) for place_m, sound in zip(places_m, sounds, strict=True)]
+
+
+@dataclass(frozen=True, slots=True)
+class KnownSound:
+    """One sound of a simulated session.
+
+    Parameters
+    ----------
+    start_s : float
+        Seconds after the beginning of the session.
+    place_m : (3,) float64
+        Where it was made, metres.
+    """
+
+    start_s: float
+    place_m: FloatArray
+
+
+def claps_by_time(sounds: Sequence[HeardSound], known: Sequence[KnownSound], begin_s: float) -> list[Clap]:
+    """Return the sounds that begin when a known sound does, each with its place; other sounds are left out.
+
+    Parameters
+    ----------
+    sounds : sequence of HeardSound
+    known : sequence of KnownSound
+    begin_s : float
+        Time of the beginning of the session, on the scale of the sounds.
+
+    Raises
+    ------
+    RunError
+        If no sound begins at such a time.
+    """
+    claps = []
+    for one in known:
+        near = min(sounds, key=lambda sound: abs(sound.start_s - begin_s - one.start_s), default=None)
+        if near is not None and abs(near.start_s - begin_s - one.start_s) <= SAME_S:
+            claps.append(Clap(one.place_m, near))
+    if not claps:
+        raise RunError(
+            f"--truth: expected sounds at the times of its {len(known)} sounds, got none of the {len(sounds)} in the "
+            "recordings at such a time; give the truth.jsonl of the same session"
+        )
+    return claps
 
 
 def verified(site: Site, claps: Sequence[Clap]) -> list[Finding]:

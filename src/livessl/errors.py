@@ -2,8 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+
+
+def did_you_mean(given: str, known: Iterable[str]) -> str:
+    """Return the known name that is most like a wrong one, as the end of a sentence; empty if none is."""
+    from difflib import get_close_matches
+
+    by_lower = {name.lower(): name for name in known}
+    similar = get_close_matches(given.lower(), by_lower, 1)
+    return f"; did you mean {by_lower[similar[0]]!r}?" if similar else ""
 
 
 class UseError(Exception):

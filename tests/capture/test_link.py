@@ -626,3 +626,18 @@ def test_sections_of_marks_are_sent_only_to_a_server_that_reads_them() -> None:
         together(link, router, lambda: link.connected, "an acknowledgement")
         assert sent() == mark(0)
         link.close(bye=False)
+
+
+def test_a_server_that_refuses_is_not_said_to_be_away(caplog: pytest.LogCaptureFixture) -> None:
+    clock = HandClock()
+    with Router() as router:
+        link = Link(router.endpoint, HELLO, clock)
+        together(link, router, lambda: router.got, "the greeting")
+        router.send(wire.encode(wire.Ack("run-1", {}, refused="another node has this name")))
+        together(link, router, lambda: link.refused, "the refusal")
+        for _ in range(3):
+            clock.time_ns += 2 * SILENT_NS
+            link.service()
+        link.close(bye=False)
+    assert "another node has this name" in caplog.text
+    assert "no server answers" not in caplog.text

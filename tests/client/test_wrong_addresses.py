@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from websockets.exceptions import InvalidMessage
 
 from livessl.cli.server_answers import ask
 from livessl.client import RefusedError, UnreachableError, aconnect, connect
@@ -162,3 +163,25 @@ def test_token_is_not_logged(caplog: pytest.LogCaptureFixture) -> None:
 def test_nobody_at_the_address_is_no_refusal() -> None:
     with connect(f"http://127.0.0.1:{free_port()}", give_up_s=0.0) as live, pytest.raises(UnreachableError):
         next(iter(live))
+
+
+@pytest.mark.parametrize(
+    ("error", "is_hinted"),
+    [
+        (TimeoutError("timed out while waiting for handshake response"), True),
+        (InvalidMessage("did not receive a valid HTTP response"), True),
+        (TimeoutError(110, "Connection timed out"), False),
+        (ConnectionRefusedError(111, "Connection refused"), False),
+    ],
+)
+def test_what_speaks_no_http_may_be_the_port_of_the_nodes(
+    error: Exception, is_hinted: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    Patience(Address("http://host", None, None), None).next_wait_s(error)
+    assert ("not that of the nodes" in caplog.text) is is_hinted
+
+
+@pytest.mark.parametrize("status", [404, 405, 501])
+def test_another_program_at_the_address_is_no_livessl_server(status: int) -> None:
+    with answering(status) as other, pytest.raises(RunError, match="is no livessl server, so check the address"):
+        ask(f"http://127.0.0.1:{other.server_address[1]}", "findings", None)

@@ -194,3 +194,27 @@ def test_a_line_is_warned_about_also_in_a_search_plane() -> None:
     assert "all microphones lie on one line along x" in said
     front = {"grid.bounds_m": [[0, 4], [2.5, 5], [1.3, 1.3]]}
     assert warnings_of({**BARE, **front, "arrays": {"north": line}}) == ()
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong"),
+    [
+        ("size_m:", "size:"),
+        ("size_m:", "sise_m:"),
+        ("edge_m:", "edge:"),
+        ("edge_m:", "egde_m:"),
+        ("edge_m:", "edge_mm:"),
+        ("room:", "rooms:"),
+        ("arrays:", "arays:"),
+    ],
+)
+def test_a_misspelt_key_is_one_fault_although_the_right_one_is_missing(right: str, wrong: str) -> None:
+    text = north(f"{TETRAHEDRON}, position_m: [4.0, 2.5, 2.0]")
+    (said,) = faults_of(text.replace(right, wrong))
+    assert f"did you mean '{right[:-1]}'?" in said
+
+
+def test_a_key_that_is_missing_beside_another_slip_is_named() -> None:
+    said = faults_of(north("geometry: {tetrahedron: {colour: 3}}, position_m: [4.0, 2.5, 2.0]"))
+    assert any("edge_m: missing" in fault for fault in said)
+    assert any("unknown key 'colour'" in fault for fault in said)

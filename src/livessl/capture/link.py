@@ -169,11 +169,12 @@ class Link:
         if self._accepted:
             _log.warning("server at %s unreachable; buffering and retrying", self.endpoint)
             self._disconnect()
-        elif not self._warned and now_ns - self._begun_ns >= SILENT_NS:
+        elif not (self._warned or self._refused) and now_ns - self._begun_ns >= SILENT_NS:
             self._warned = True
             hint = " Check also that this node's key is enrolled there, and that server.public is the server's key."
             _log.warning(
-                "no server answers at %s; buffering and retrying. Check that `livessl serve` runs there.%s",
+                "no server answers at %s; buffering and retrying. Check that `livessl serve` runs there, and that the "
+                "port is that of server.bind, not of the dashboard.%s",
                 self.endpoint,
                 hint if self._keyed else "",
             )

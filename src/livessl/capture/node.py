@@ -178,7 +178,10 @@ def send_session(
     link.wait_connected(stop)
     if not (link.connected or link.refused or stop()):
         link.close(bye=False)
-        raise UndeliveredError(f"expected a server at {endpoint}, got no answer; start it, or correct the address")
+        raise UndeliveredError(
+            f"expected a server at {endpoint}, got no answer; start it, or correct the address, whose port is that of "
+            "server.bind, not of the dashboard"
+        )
     lead = _Lead(link, clock)
     end_ns = 0
     for end_ns in _sent(link, pipelines, inputs, pace, lambda: stop() or link.refused is not None):

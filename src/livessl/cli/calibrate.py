@@ -23,7 +23,8 @@ from livessl.cli.exits import FAILED, OK
 from livessl.cli.options import add_calibration_file, add_json, read_site
 from livessl.cli.output import complain, print_warnings
 from livessl.cli.server_answers import add_server
-from livessl.errors import ConfigError, UseError
+from livessl.cli.truth_file import add_truth, truth_given
+from livessl.errors import ConfigError, UseError, did_you_mean
 
 if TYPE_CHECKING:
     from livessl.calibration import Clap, HeardSound
@@ -59,6 +60,7 @@ def _add_verify(actions: Any) -> None:
         "verify --site site.yaml --at 2,3,1.2 --at 6,8,1.2",
     )
     _add_places(sub, "place of a clap in metres; repeat for each, in the order in which they are made")
+    add_truth(sub)
     add_json(sub, "print one JSON object for each clap and each finding")
 
 
@@ -74,6 +76,7 @@ def _add_poses(actions: Any) -> None:
         sub,
         "place of a clap in metres; repeat for each clap. With a running server --at is optional: places are proposed",
     )
+    add_truth(sub)
     sub.add_argument(
         "--place-std",
         type=argument.above_zero,
@@ -155,6 +158,8 @@ def run(arguments: argparse.Namespace) -> int:
         return OK
     if len(getattr(arguments, "at", [])) > MOST_CLAPS:
         raise UseError(f"--at: expected {MOST_CLAPS} places at most, got {len(arguments.at)}")
+    if getattr(arguments, "write", None) is not None:
+        calibration_file.refuse_foreign_file(arguments)
     return int(arguments.act(arguments))
 
 
@@ -171,6 +176,10 @@ def _server_of_file(arguments: argparse.Namespace) -> str | None:
 def _is_live(arguments: argparse.Namespace) -> bool:
     """Return whether a running server is meant: --url, or --site without recordings."""
     recorded = bool(arguments.session or arguments.wav)
+    if not recorded and arguments.channels:
+        raise UseError("calibrate: --channels names channels of the files of --wav, and none is given; remove it")
+    if not recorded and getattr(arguments, "truth", None) is not None:
+        raise UseError("calibrate: --truth belongs to a simulated session; give the session as --session DIR")
     if arguments.url and recorded:
         raise UseError(
             "calibrate: expected a running server (--url) or recordings (--session, --wav); give one of them"
@@ -231,8 +240,12 @@ def _recorded(arguments: argparse.Namespace) -> tuple[Site, list[HeardSound], Se
 def _recorded_claps(arguments: argparse.Namespace) -> tuple[Site, list[Clap]]:
     import numpy as np
 
-    from livessl.calibration import claps_of
+    from livessl.calibration import claps_by_time, claps_of
 
+    if arguments.truth is not None:
+        known = truth_given(arguments)
+        site, sounds, parts = _recorded(arguments)
+        return site, claps_by_time(sounds, known, min(part.start_ns for part in parts) / 1e9)
     _require_places(arguments)
     site, sounds, _ = _recorded(arguments)
     _require_inside(site, arguments)
@@ -241,7 +254,10 @@ def _recorded_claps(arguments: argparse.Namespace) -> tuple[Site, list[Clap]]:
 
 def _require_places(arguments: argparse.Namespace) -> None:
     if not arguments.at:
-        raise UseError("calibrate: expected --at X,Y,Z for each clap, got none; give the places in metres")
+        raise UseError(
+            "calibrate: expected --at X,Y,Z for each clap, got none; give the places in metres, or --truth "
+            "SESSION/truth.jsonl for a simulated session"
+        )
 
 
 def _require_inside(site: Site, arguments: argparse.Namespace) -> None:
@@ -262,7 +278,8 @@ def _verify(arguments: argparse.Namespace) -> int:
     def show(clap: Clap) -> None:
         print(json.dumps(clap_object(clap)) if arguments.json else clap_line(clap), flush=True)
 
-    _require_places(arguments)
+    if arguments.truth is None:
+        _require_places(arguments)
     if _is_live(arguments):
         from livessl.cli.guided import claps_at
 
@@ -324,7 +341,10 @@ def _refine(arguments: argparse.Namespace) -> int:
     names = [spec.name for spec in site.processed]
     stranger = next((name for name in arguments.known if name not in names), None)
     if stranger is not None:
-        raise UseError(f"--known: expected an array of the site ({', '.join(names)}), got {stranger!r}")
+        raise UseError(
+            f"--known: expected an array of the site ({', '.join(names)}), got {stranger!r}"
+            f"{did_you_mean(stranger, names)}"
+        )
     known = arguments.known or names[:1]
     if not arguments.known:
         complain(f"{known[0]!r} is taken to be where the site file says; --known ARRAY names another", kind="note")

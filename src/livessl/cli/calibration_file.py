@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 from livessl.cli.options import BESIDE_THE_SITE
 from livessl.cli.output import complain
+from livessl.cli.own_work import refuse_foreign
 from livessl.cli.server_answers import order
 from livessl.clock import SystemClock
 from livessl.errors import ConfigError, RunError, UseError
@@ -47,6 +48,33 @@ def write(arguments: argparse.Namespace, site: Site, action: str, measured: Meas
     hint = "" if found else f"; name it in the site file as calibration: {_relative(path, arguments)}"
     complain(f"written to {path}{hint}", kind="note")
     return path
+
+
+def refuse_foreign_file(arguments: argparse.Namespace) -> None:
+    """Raise `UseError` if --write names a file that is no calibration, such as the site file."""
+    path: Path = arguments.write
+    if path == BESIDE_THE_SITE:
+        if arguments.site is None:
+            return  # there is no place beside it
+        try:
+            path = _named(arguments.site)
+        except UseError:
+            return  # it is no valid site file, as its reader says
+    refuse_foreign("--write", [path], _is_calibration, arguments.site)
+
+
+def _is_calibration(path: Path) -> bool:
+    """Return whether a file has the keys of a calibration, be their values right or wrong."""
+    import yaml
+
+    from livessl.site.findings import read_yaml
+    from livessl.site.models import CalibrationFile
+
+    try:
+        data = read_yaml(path.read_text(encoding="utf-8"))
+    except (UnicodeDecodeError, yaml.YAMLError, RecursionError):
+        return False
+    return isinstance(data, dict) and "arrays" in data and data.keys() <= CalibrationFile.model_fields.keys()
 
 
 def _check_room(site: Site, arrays: Mapping[str, CalibratedArray]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from livessl.core.commission.finding import Finding
     from livessl.examination import Examination
     from livessl.recordings.assign import AssignedRecording
+    from livessl.recordings.session import Session
     from livessl.site.models import Site
 
 
@@ -44,6 +46,13 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
     from livessl.core.commission.finding import LEAST_SOUNDS
 
+    if arguments.url and (
+        arguments.session or arguments.wav or arguments.channels or arguments.joint or arguments.site
+    ):
+        raise UseError(
+            "doctor: with --url the server's own sounds and site file are examined, so that --site, --session, --wav, "
+            "--channels and --joint have no effect; remove them, or --url"
+        )
     examination = _ask(arguments.url, arguments.token_file) if arguments.url else _examine(arguments)
     for finding in examination.findings:
         print(
@@ -99,16 +108,39 @@ def recordings_given(
             f"{command}: expected --session DIR, or --wav ARRAY=FILE for each array{otherwise}; give one of them"
         )
     if arguments.session:
+        if arguments.channels:
+            raise UseError(
+                f"{command}: --channels names channels of the files of --wav, and has no effect on a session; remove "
+                "it, and give the order in the site file (nodes.NAME.arrays) with --site"
+            )
         sessions = [read_session(directory) for directory in arguments.session]
         joint = joints(arguments)
         site = load_site(arguments.site, joint) if arguments.site else sessions[0].site(joint)
         parts = list(assign_sessions(site, sessions))
+        site = _with_recorded_inputs(site, sessions)
     elif arguments.site is None:
         raise UseError(f"{command}: expected --site FILE with --wav; give the site file that the recordings belong to")
     else:
         site = read_site(arguments)
         parts = list(assign_files(site, *wavs(arguments)))
     return site, parts, span_ns(parts)
+
+
+def _with_recorded_inputs(site: Site, sessions: Sequence[Session]) -> Site:
+    """Return the site with the inputs that sessions were recorded from, where it has others; findings name them."""
+    recorded = {array: inputs for session in sessions for array, inputs in session.inputs().items()}
+
+    def of_recording(array: str, inputs: list[int]) -> list[int]:
+        found = recorded.get(array, inputs)
+        return inputs if sorted(found) == sorted(inputs) else found  # in another order, they are those of the channels
+
+    nodes = {
+        name: node.model_copy(
+            update={"arrays": {array: of_recording(array, inputs) for array, inputs in node.arrays.items()}}
+        )
+        for name, node in site.nodes.items()
+    }
+    return site.model_copy(update={"nodes": nodes})
 
 
 def finding_line(finding: Finding) -> str:

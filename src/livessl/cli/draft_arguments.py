@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from livessl.cli import argument
+from livessl.errors import did_you_mean
 from livessl.site.draft_parts import MICROPHONES, SIZE_M
 
 SIZES: Final = {
@@ -48,7 +49,9 @@ def array(text: str) -> ArrayWish:
         raise argparse.ArgumentTypeError(f"{_EXPECTED} {text!r}")
     kind, count = found["kind"], found["count"]
     if kind not in SIZE_M:
-        raise argparse.ArgumentTypeError(f"expected an array of kind {', '.join(SIZE_M)}, got {kind!r}")
+        raise argparse.ArgumentTypeError(
+            f"expected an array of kind {', '.join(SIZE_M)}, got {kind!r}{did_you_mean(kind, SIZE_M)}"
+        )
     if count is not None and kind not in COUNTED:
         raise argparse.ArgumentTypeError(f"expected {kind}:SIZE, which has {MICROPHONES} microphones, got {text!r}")
     place, _, yaw = (found["pose"] or "")[1:].partition("@")

@@ -14,6 +14,7 @@ from typing import Final
 from livessl import __version__
 from livessl.cli.exits import FAILED, INTERRUPTED, OK, WRONG_USE, sigterm_as_ctrl_c
 from livessl.cli.output import complain
+from livessl.cli.parser import Parser
 from livessl.cli.standard_streams import open_standard_streams
 from livessl.errors import RunError, UseError
 from livessl.log_format import VARIABLE, LogForm, log_form, set_up_logging
@@ -153,9 +154,7 @@ def _of_file(error: OSError) -> str:
 
 def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
     """Return the parser of all commands; only the command that is given is imported and described in full."""
-    parser = argparse.ArgumentParser(
-        prog="livessl", description="Locate sounds in a room, live.", epilog="example: livessl demo"
-    )
+    parser = Parser(prog="livessl", description="Locate sounds in a room, live.", epilog="example: livessl demo")
     parser.add_argument("-V", "--version", action="version", version=f"livessl {__version__}")
     parser.add_argument("--verbose", action="store_true", help="log debug messages to stderr as well")
     parser.add_argument(

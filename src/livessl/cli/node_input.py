@@ -10,7 +10,7 @@ from livessl.capture.device import Device
 from livessl.cli import progress
 from livessl.cli.options import wavs
 from livessl.clock import Clock
-from livessl.errors import ConfigError, Fault
+from livessl.errors import ConfigError, Fault, did_you_mean
 from livessl.recordings.assign import AssignedRecording
 from livessl.site.models import Site
 from livessl.site.node_models import NodeConfig, SoundDeviceConfig
@@ -26,7 +26,9 @@ def node_config(site: Site, name: str, path: Path) -> NodeConfig:
     """
     if name not in site.nodes:
         known = ", ".join(site.nodes) or "none"
-        raise ConfigError([Fault(f"{path}: nodes", f"expected one of {known}, got --node {name}")])
+        raise ConfigError(
+            [Fault(f"{path}: nodes", f"expected one of {known}, got --node {name}{did_you_mean(name, site.nodes)}")]
+        )
     return site.nodes[name]
 
 
@@ -43,7 +45,12 @@ def check_files(arguments: argparse.Namespace, config: NodeConfig) -> None:
     if files:
         strangers = [name for name in files if name not in config.arrays]
         missing = [name for name in config.arrays if name not in files]
-        faults += [Fault(f"--wav {name}=…", f"node {arguments.node!r} has the arrays {known}") for name in strangers]
+        faults += [
+            Fault(
+                f"--wav {name}=…", f"node {arguments.node!r} has the arrays {known}{did_you_mean(name, config.arrays)}"
+            )
+            for name in strangers
+        ]
         faults += [Fault("--wav", f"expected a file for each of {known}; add --wav {name}=FILE") for name in missing]
     else:
         given = {"--channels": arguments.channels}

@@ -11,6 +11,7 @@ from livessl.cli import argument, progress
 from livessl.cli.exits import OK, WRONG_USE
 from livessl.cli.options import add_json, add_site, make_folder
 from livessl.cli.output import complain
+from livessl.cli.own_work import is_own_json, is_own_picture, refuse_foreign
 from livessl.lab.plan.defaults import CALIBRATION_M
 
 
@@ -39,7 +40,12 @@ def add_arguments(parser: Any) -> None:
         f"(default {CALIBRATION_M:g})",
     )
     add_json(parser, "print one JSON object")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="also write plan.json and plan.png to DIR")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        metavar="DIR",
+        help="also write plan.json and plan.png to DIR; those of an earlier plan are replaced",
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -50,6 +56,7 @@ def run(arguments: argparse.Namespace) -> int:
     site = load_site(arguments.site)
     if arguments.out is not None:
         figure.require_matplotlib()
+        _refuse_foreign(arguments.out, arguments.site)
         make_folder(arguments.out, "--out")
     try:
         with progress.counted("trying positions", "array") as bar:
@@ -63,3 +70,10 @@ def run(arguments: argparse.Namespace) -> int:
         figure.draw(plan, arguments.out / "plan.png")
     print(json.dumps(result, allow_nan=False) if arguments.json else words.as_text(plan))
     return OK
+
+
+def _refuse_foreign(out: Path, site: Path) -> None:
+    """Raise an error if the folder holds a plan or a picture of that name from somebody else."""
+    keys = frozenset({"site", "rt60_s", "predicted_error", "advice"})
+    refuse_foreign(f"--out {out}", [out / "plan.json"], lambda path: is_own_json(path, keys), site)
+    refuse_foreign(f"--out {out}", [out / "plan.png"], is_own_picture, site)

@@ -11,6 +11,7 @@ from livessl.cli import argument, progress
 from livessl.cli.exits import FAILED, OK, stop_on_signal
 from livessl.cli.options import add_site, add_wav
 from livessl.cli.output import complain
+from livessl.cli.own_work import refuse_foreign
 from livessl.clock import SystemClock
 from livessl.errors import ConfigError, Fault
 
@@ -45,7 +46,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise ConfigError([Fault(f"{arguments.site}: privacy", what)])
     config = node_config(site, arguments.node, arguments.site)
     check_files(arguments, config)
-    _refuse_to_overwrite(arguments.out)
+    _refuse_to_overwrite(arguments.out, arguments.site)
     clock = SystemClock()
     begun_ns, begun = clock.now_ns(), clock.monotonic_ns()
     length_ns = None if arguments.duration is None else round(arguments.duration * 1e9)
@@ -74,9 +75,9 @@ def run(arguments: argparse.Namespace) -> int:
     return OK
 
 
-def _refuse_to_overwrite(directory: Path) -> None:
-    """Raise an error if a folder holds recordings: they are neither overwritten nor mixed with others."""
-    from livessl.recordings.session import SESSION_FILE
+def _refuse_to_overwrite(directory: Path, site: Path) -> None:
+    """Raise an error if a folder holds recordings or a site file, which are neither replaced nor mixed with others."""
+    from livessl.recordings.session import SESSION_FILE, SITE_FILE
 
     held = directory.iterdir() if directory.is_dir() else ()
     names = sorted(path.name for path in held if path.name == SESSION_FILE or path.suffix.lower() in (".wav", ".flac"))
@@ -84,3 +85,4 @@ def _refuse_to_overwrite(directory: Path) -> None:
         raise ConfigError(
             [Fault(f"--out {directory}", f"already holds a session or recordings ({names[0]}); choose another folder")]
         )
+    refuse_foreign(f"--out {directory}", [directory / SITE_FILE], lambda _: False, site)

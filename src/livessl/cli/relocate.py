@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from livessl.cli import argument, progress
 from livessl.cli.exits import FAILED, OK
@@ -26,6 +26,10 @@ if TYPE_CHECKING:
     from livessl.server.clips.reader import ClipReader
     from livessl.server.clips.relocate_many import Task
     from livessl.site.models import Site
+
+
+BEGINNING: Final = b'{"kind": "relocation"'
+"""Beginning of each line in a file of answers."""
 
 
 def add_arguments(parser: Any) -> None:
@@ -248,7 +252,7 @@ def _sorted_out(path: Path, task: Archive, wanted: frozenset[str]) -> set[str]:
     known: set[str] = set()
     kept: list[bytes] = []
     for line in path.read_bytes().splitlines(keepends=True):
-        if not line.endswith(b"\n"):  # a command that was killed has left it; it is written again
+        if not line.endswith(b"\n") and is_begun(line):  # a command that was killed has left it; it is written again
             break
         event_id, is_located = _held(path, line, task)
         if is_located:
@@ -259,6 +263,11 @@ def _sorted_out(path: Path, task: Archive, wanted: frozenset[str]) -> set[str]:
     fresh.write_bytes(b"".join(kept))
     fresh.replace(path)
     return known
+
+
+def is_begun(line: bytes) -> bool:
+    """Return whether bytes are the beginning of an answer, and not another file without an end of line."""
+    return line[: len(BEGINNING)] == BEGINNING[: len(line)]
 
 
 def _held(path: Path, line: bytes, task: Archive) -> tuple[str, bool]:

@@ -161,6 +161,8 @@ def _answer(address: str, token_file: Path | None, body: bytes | None, wait_s: f
         reason = _reason(error)
         said = redirection(error) or (reason and f": {reason}")
         cure = "; give --token-file" if error.code in (401, 403) and token_file is None else ""
+        if error.code in (404, 405, 501) and not said:  # a livessl server gives a reason
+            cure = "; what answers there is no livessl server, so check the address"
         text = f"{address}: the server answered {error.code} {error.reason}{said}{cure}"
         raise RefusedError(text, error.code, reason) from error
     except (OSError, ValueError, HTTPException) as error:

@@ -11,6 +11,7 @@ from livessl.cli import argument, progress
 from livessl.cli.exits import OK, WRONG_USE
 from livessl.cli.options import add_site, make_folder
 from livessl.cli.output import complain
+from livessl.cli.own_work import refuse_foreign
 from livessl.errors import ConfigError, Fault
 
 
@@ -35,7 +36,7 @@ def add_arguments(parser: Any) -> None:
         type=Path,
         required=True,
         metavar="DIR",
-        help="folder for the session; a recorded session there is not overwritten",
+        help="folder for the session: new, empty, or with a simulated session, which is replaced",
     )
     parser.add_argument("--count", type=argument.positive, default=8, help="number of sounds in the scene (default 8)")
     parser.add_argument(
@@ -52,7 +53,7 @@ def add_arguments(parser: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
     from livessl.recordings.session import SESSION_FILE
-    from livessl.simulation.export import TRUTH_FILE, write_scene
+    from livessl.simulation.export import TRUTH_FILE, scene_files, simulated_files, write_scene
     from livessl.simulation.of_site import DEFAULT_RATE_HZ, device_rates_hz, scene_of
     from livessl.simulation.scene import read_sounds
     from livessl.site.load import load_site
@@ -60,6 +61,8 @@ def run(arguments: argparse.Namespace) -> int:
     site = load_site(arguments.site)
     if (arguments.out / SESSION_FILE).exists() and not (arguments.out / TRUTH_FILE).exists():
         raise ConfigError([Fault(f"--out {arguments.out}", "holds a recorded session; choose another folder")])
+    own = simulated_files(arguments.out)
+    refuse_foreign(f"--out {arguments.out}", scene_files(arguments.out, site), own.__contains__, arguments.site)
     rates = {} if arguments.sample_rate else device_rates_hz(site)
     rate = float(arguments.sample_rate or max(rates.values(), default=DEFAULT_RATE_HZ))
     try:

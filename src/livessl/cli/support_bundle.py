@@ -76,6 +76,8 @@ def run(arguments: argparse.Namespace) -> int:
     time_utc = utc_text(SystemClock().now_ns())
     stamp = time_utc.partition(".")[0].replace("-", "").replace(":", "")
     path = arguments.out or Path(f"livessl-support-{stamp}Z.zip")
+    if path.exists():
+        raise RunError(f"--out: {path} exists already; give another name")
     bundle = Bundle()
     data = _add_site(bundle, arguments.site)
     bundle.add("versions.json", lambda: _json(_versions()))

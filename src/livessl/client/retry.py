@@ -6,7 +6,7 @@ import logging
 import random
 from typing import Final
 
-from websockets.exceptions import ConnectionClosed, InvalidStatus, InvalidURI, WebSocketException
+from websockets.exceptions import ConnectionClosed, InvalidMessage, InvalidStatus, InvalidURI, WebSocketException
 
 from livessl.client.address import Address, RefusedError, may_pass
 from livessl.clock import SystemClock
@@ -93,7 +93,8 @@ class Patience:
         self._opened_ns = None
         if self._lost_ns is None:
             self._lost_ns = now_ns
-            _log.warning("%s: no connection (%s); trying again", self._address.url, str(error) or type(error).__name__)
+            said = str(error) or type(error).__name__
+            _log.warning("%s: no connection (%s); trying again%s", self._address.url, said, _hint(error))
         if self._give_up_s is not None and now_ns - self._lost_ns >= 1e9 * self._give_up_s:
             raise (error if isinstance(error, RunError) else self._address.lost(error)) from error
         wait_s, self._wait_s = self._wait_s, min(GROWTH * self._wait_s, LONGEST_WAIT_S)
@@ -121,3 +122,11 @@ class Patience:
             lost = self._address.lost(error)
             return lost if isinstance(lost, RefusedError) else None
         return None
+
+
+def _hint(error: Exception) -> str:
+    """Return what to check if something listens at the address, and does not answer as a web server does."""
+    is_silent = isinstance(error, TimeoutError) and error.errno is None  # others come from the network
+    if not (is_silent or isinstance(error, InvalidMessage)):
+        return ""
+    return ". Check the port: that of the dashboard (server.http) is needed, not that of the nodes (server.bind)"

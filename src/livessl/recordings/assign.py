@@ -10,7 +10,7 @@ from typing import Final
 from livessl.core.joint_array import require_one_clock
 from livessl.core.stream.pipeline import Pipeline
 from livessl.core.types import FRAME_NS
-from livessl.errors import DeviceError
+from livessl.errors import DeviceError, did_you_mean
 from livessl.recordings.open_files import OpenFiles
 from livessl.recordings.recording import (
     EmptyFileError,
@@ -159,8 +159,8 @@ def assign_files(
     unknown = sorted(set(wanted) - set(files))
     if unknown:
         raise DeviceError(
-            f"channels of array {unknown[0]!r}: expected an array with a recording ({', '.join(files)}); "
-            "give its recording, or leave its channels out"
+            f"channels of array {unknown[0]!r}: expected an array with a recording ({', '.join(files)})"
+            f"{did_you_mean(unknown[0], files) or '; give its recording, or leave its channels out'}"
         )
     given = [
         (name, (paths,) if isinstance(paths, Path) else tuple(paths), start_ns + _wav_offset_ns(site, name))
@@ -178,13 +178,16 @@ def _wav_offset_ns(site: Site, array: str) -> int:
 def assign_sessions(site: Site, sessions: Iterable[Session]) -> list[AssignedRecording]:
     """Return the recordings of one or more sessions at their original times; each node records a session of its own.
 
-    Files without any sound, as a recorder leaves them that is killed just after a gap, are left out.
+    If the site file gives the inputs that an array was recorded from in another order than the session's own site file,
+    its channels are taken in the order of the site file. Files without any sound, as a recorder leaves them that is
+    killed just after a gap, are left out.
 
     Raises
     ------
     DeviceError
         One line for each file that does not fit.
     """
+    sessions = list(sessions)
     files, given, skipped = OpenFiles(), [], []
     for session in sessions:
         for piece in session.pieces:
@@ -204,7 +207,43 @@ def assign_sessions(site: Site, sessions: Iterable[Session]) -> list[AssignedRec
     given += [entry for entry in skipped if entry[0] not in heard]
     joint = {member for name in site.joint for member in site.members(name)}
     files.match_ends([(path, start_ns) for array, (path,), start_ns in given if array in joint])
-    return _assign(site, given, {}, files)
+    orders = _reordered(site, sessions, files)
+    return _assign(site, given, {}, files, orders)
+
+
+def _reordered(site: Site, sessions: Sequence[Session], files: OpenFiles) -> dict[str, list[int]]:
+    """Return the channels of sessions, by array, where the site file gives the recorded inputs in another order.
+
+    Raises
+    ------
+    DeviceError
+        If sessions of one array were recorded in different orders, and the site file gives another than the session's.
+    """
+    wanted = {name: inputs for node in site.nodes.values() for name, inputs in node.arrays.items()}
+    found: dict[str, list[int]] = {}
+    for session in sessions:
+        pieces = {piece.array for piece in session.pieces}
+        for array, inputs in session.inputs().items():
+            if array not in pieces or array not in wanted:
+                continue
+            if sorted(inputs) != sorted(wanted[array]) or len(set(inputs)) != len(inputs):
+                files.notes.append(
+                    f"{session.directory}: array {array!r} was recorded from the inputs {_listed(inputs)}, and the "
+                    f"site file gives {_listed(wanted[array])}; channels are taken as they were recorded: record again "
+                    "to use the inputs of the site file"
+                )
+                continue
+            order = [inputs.index(number) + 1 for number in wanted[array]]
+            if found.setdefault(array, order) != order:
+                raise DeviceError(
+                    f"{session.directory}: expected array {array!r} recorded in the order of the other sessions, got "
+                    f"the inputs {_listed(inputs)}; give sessions of different wirings one by one"
+                )
+    return {array: order for array, order in found.items() if order != sorted(order)}
+
+
+def _listed(inputs: Iterable[int]) -> str:
+    return ", ".join(map(str, inputs))
 
 
 def common_start_ns(now_ns: int, nodes: int) -> int:
@@ -296,8 +335,12 @@ def _assign(
     given: Sequence[tuple[str, tuple[Path, ...], int]],
     channels: Mapping[str, Sequence[int]],
     files: OpenFiles,
+    orders: Mapping[str, Sequence[int]] | None = None,
 ) -> list[AssignedRecording]:
-    """Open `given` (array, its files, start in ns); recordings of one array at several times become one with gaps."""
+    """Open `given` (array, its files, start in ns); recordings of one array at several times become one with gaps.
+
+    `orders` are channels of recordings that have no others.
+    """
     segments: dict[str, list[TimedRecording]] = {}
     chosen: dict[str, tuple[int, ...]] = {}
     faults: list[str] = []
@@ -305,11 +348,12 @@ def _assign(
         known = (*site.arrays, *site.joint)
         if array not in known:
             names = ",".join(map(str, paths))
-            faults.append(f"{array}={names}: no such array; arrays are {', '.join(known)}")
+            faults.append(f"{array}={names}: no such array; arrays are {', '.join(known)}{did_you_mean(array, known)}")
             continue
         try:
             recording = files.stacked(array, paths)
-            wanted = channels.get(array)
+            order = (orders or {}).get(array)
+            wanted = channels.get(array, order if order and len(order) == recording.channels else None)
             chosen[array] = tuple(recording_channels(site, array, recording, wanted))
             files.use(array, paths, chosen[array])
         except DeviceError as error:

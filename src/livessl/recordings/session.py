@@ -66,6 +66,21 @@ class Session:
         """Return the site of the recording, with the joint arrays of `joint` in addition to its own."""
         return load_site(self.directory / SITE_FILE, joint)
 
+    def inputs(self) -> dict[str, list[int]]:
+        """Return the inputs of the device that were recorded, by array, in the order of the channels of its files.
+
+        Arrays without a node are left out, and all arrays if the session's site file cannot be read.
+        """
+        try:
+            data = read_yaml((self.directory / SITE_FILE).read_text(encoding="utf-8"))
+            return {
+                str(name): [int(number) for number in numbers]
+                for node in data.get("nodes", {}).values()
+                for name, numbers in node.get("arrays", {}).items()
+            }
+        except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError, AttributeError, TypeError, ValueError):
+            return {}
+
 
 def piece(array: str, file: str, start_ns: int) -> Piece:
     """Return a piece that begins at a site time."""
@@ -80,6 +95,15 @@ def write_session(directory: Path, site: Site, pieces: list[Piece]) -> None:
     described = _SessionFile(version=VERSION, pieces=pieces).model_dump()
     _replace(directory / SITE_FILE, site_text(site))
     _replace(directory / SESSION_FILE, yaml.safe_dump(described, sort_keys=False))
+
+
+def holds_copied_site(directory: Path) -> bool:
+    """Return whether the site file in a folder is a session's copy, and not one with comments or another layout."""
+    try:
+        text = (directory / SITE_FILE).read_text(encoding="utf-8")
+        return bool(text == _site_yaml(read_yaml(text)))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError):
+        return False
 
 
 def _replace(path: Path, text: str) -> None:
@@ -140,4 +164,8 @@ def site_text(site: Site) -> str:
         data["arrays"][spec.name] = array
     for name, node in site.nodes.items():
         data["nodes"][name]["device"]["type"] = node.device.type
-    return yaml.safe_dump(data, sort_keys=False, default_flow_style=None)
+    return _site_yaml(data)
+
+
+def _site_yaml(data: Any) -> str:
+    return str(yaml.safe_dump(data, sort_keys=False, default_flow_style=None))

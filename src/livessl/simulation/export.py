@@ -13,7 +13,8 @@ import soundfile
 from scipy.signal import resample_poly
 
 from livessl.core.types import Float32Array
-from livessl.recordings.session import piece, write_session
+from livessl.errors import ConfigError
+from livessl.recordings.session import SESSION_FILE, SITE_FILE, holds_copied_site, piece, read_session, write_session
 from livessl.simulation.of_site import rendered
 from livessl.simulation.scene import Scene, truth
 from livessl.site.models import Site
@@ -22,6 +23,28 @@ TRUTH_FILE: Final = "truth.jsonl"
 
 NOMINAL_START_NS: Final = 1_767_225_600_000_000_000
 """Start of every simulated session, 2026-01-01T00:00:00Z, so that sessions of the same seed have the same bytes."""
+
+
+def scene_files(directory: Path, site: Site) -> list[Path]:
+    """Return the files that `write_scene` writes, the site file first."""
+    recordings = [f"{name}.wav" for name in site.arrays]
+    return [directory / name for name in (SITE_FILE, *recordings, TRUTH_FILE, SESSION_FILE)]
+
+
+def simulated_files(directory: Path) -> frozenset[Path]:
+    """Return the files of the simulated session in a folder; none if there is no such session.
+
+    A site file that somebody has written is none of them: it has comments, or another layout than a session's copy.
+    """
+    try:
+        session = read_session(directory)
+    except ConfigError:
+        return frozenset()
+    if not (directory / TRUTH_FILE).is_file():
+        return frozenset()
+    found = {directory / TRUTH_FILE, directory / SESSION_FILE, *map(session.path, session.pieces)}
+    found |= {directory / SITE_FILE} if holds_copied_site(directory) else set()
+    return frozenset(path for path in found if not path.is_symlink())
 
 
 def write_scene(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any, Final, TypeVar, get_args, get_origin
 import yaml
 from pydantic import BaseModel, ValidationError
 
-from livessl.errors import ConfigError, Fault
+from livessl.errors import ConfigError, Fault, did_you_mean
 from livessl.site.place import Finding, Place
 from livessl.site.slips import slip
 
@@ -53,6 +54,9 @@ _FOREIGN_UNITS: Final = {
     "us": ("s", "microseconds"),
 }
 """Ends of keys in units that are not used, each with the end and the unit's name: the value must be converted, too."""
+
+_MEANT: Final = re.compile(r"^unknown key .*; did you mean '([^']+)'\?")
+"""Finds the key that the sentence of `unknown_key` proposes."""
 
 _MOST_PLACES: Final = 3
 """Most places that are named for a key that stands at the wrong one."""
@@ -189,12 +193,19 @@ def duplicate_keys(node: yaml.Node | None, place: Place = ()) -> Iterator[Findin
 def validation_findings(model: type[BaseModel], errors: Iterable[Mapping[str, Any]]) -> list[Finding]:
     """Return pydantic's errors for a file that `model` describes, each as one sentence."""
     found: list[Finding] = []
+    missing: dict[Place, Finding] = {}
     for error in errors:
         place = tuple(part for part in error["loc"] if part != "[key]")
         if error["type"] == "extra_forbidden":
             found.append((place, _unknown_key(model, place)))
         else:
             found.append((place, _sentence(error)))
+        if error["type"] == "missing":
+            missing[place] = found[-1]
+    for place, what in list(found):  # a key that is misspelt is missing, too: one slip is one fault
+        meant = _MEANT.search(what)
+        if meant is not None and (there := missing.pop((*place[:-1], meant[1]), None)) is not None:
+            found.remove(there)
     return found
 
 
@@ -236,9 +247,9 @@ def places_of(model: type[BaseModel], key: str, place: str = "") -> list[str]:
 
 def unknown_array(name: str, known: Iterable[str]) -> str:
     """Return the sentence for an array that the file does not have, with the name that is most like it."""
-    similar = get_close_matches(name.lower(), list(known), 1)
-    cure = f"did you mean {similar[0]!r}?" if similar else "correct the name or add the array"
-    return f"expected one of the arrays {', '.join(known)}, got {name!r}; {cure}"
+    names = list(known)
+    cure = did_you_mean(name, names) or "; correct the name or add the array"
+    return f"expected one of the arrays {', '.join(names)}, got {name!r}{cure}"
 
 
 def _unknown_key(model: type[BaseModel], place: Place) -> str:

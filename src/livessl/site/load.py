@@ -49,8 +49,16 @@ def load_site(path: Path | str, joint: Mapping[str, Sequence[str]] | None = None
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError([Fault(str(path), f"cannot be read: {reason(error)}")]) from error
+        raise ConfigError([Fault(str(path), f"cannot be read: {reason(error)}{_cure(error)}")]) from error
     return parse_site(text, str(path), path.parent, joint)
+
+
+def _cure(error: Exception) -> str:
+    if isinstance(error, FileNotFoundError):
+        return "; correct the name, or make a site file with `livessl init`"
+    if isinstance(error, IsADirectoryError):
+        return "; name the site file in it, such as site.yaml, or make one with `livessl init`"
+    return ""
 
 
 def parse_site(

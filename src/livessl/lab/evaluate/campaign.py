@@ -6,10 +6,11 @@ import json
 import os
 import resource
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
@@ -19,6 +20,12 @@ from threadpoolctl import threadpool_limits
 from livessl.lab.evaluate.job import Job, Unit
 from livessl.lab.evaluate.parquet import write_smallest
 from livessl.workers import on_cores
+
+REPORT_FILES: Final = ("report.md", "summary.csv", "claims.md", "claims.csv", "figures")
+"""What a report writes into a folder."""
+
+FILES: Final = ("results.parquet", "parts", "cost.jsonl", *REPORT_FILES)
+"""What a campaign and its report write into a folder, besides `campaign.json`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,16 +143,43 @@ def _by_dask(job: Job, wanted: list[int], scheduler: str | None) -> Iterator[Don
 def _claim(out: Path, job: Job) -> None:
     path = out / "campaign.json"
     if path.exists():
-        held = json.loads(path.read_text(encoding="utf-8"))
+        held = _claimed(path)
         if held.get("digest") != job.digest:
             raise ValueError(
                 f"--out {out}: expected an empty folder or the same campaign, got one with other settings or sounds; "
                 f"see {path}, or choose another folder"
             )
+    else:
+        require_no_others(out, FILES)
     out.mkdir(parents=True, exist_ok=True)
     sounds = {name: [clip for clip, _ in clips] for name, clips in job.clips.items()}
     text = json.dumps({"digest": job.digest, "settings": job.settings.as_dict(), "sounds": sounds}, indent=1)
     _write(path, text.encode())
+
+
+def require_no_others(out: Path, names: Sequence[str]) -> None:
+    """Check that a folder holds none of some files, which nobody knows to be ours.
+
+    Raises
+    ------
+    ValueError
+        If it does.
+    """
+    found = next((out / name for name in names if os.path.lexists(out / name)), None)
+    if found is not None:
+        raise ValueError(
+            f"--out {out}: expected a new or an empty folder, got one with {found.name}, which no campaign here made "
+            "and which would be written over; name another folder"
+        )
+
+
+def _claimed(path: Path) -> dict[str, Any]:
+    """Return what a campaign has written of itself; an empty object if the file is another."""
+    try:
+        held = json.loads(path.read_bytes())
+    except (ValueError, RecursionError):
+        return {}
+    return held if isinstance(held, dict) else {}
 
 
 def _unpack(results: Path, parts: Path, schema: pa.Schema) -> None:

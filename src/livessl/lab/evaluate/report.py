@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from livessl.lab.evaluate.campaign import read_costs
+from livessl.lab.evaluate.campaign import REPORT_FILES, read_costs, require_no_others
 from livessl.lab.evaluate.claims import claims
 from livessl.lab.evaluate.figures.medians import draw_all
 from livessl.lab.evaluate.markdown import Block, Heading, Picture, Table, as_markdown
@@ -48,6 +48,9 @@ OTHER_LAYOUT: Final = (
 )
 """The same for rooms and arrays of a site file."""
 
+_TITLES: Final = ("The paper, reproduced", "The paper's experiments with other arrays")
+"""Titles of a report, with the paper's arrays and with others."""
+
 _RUN_TITLES: Final = (
     "experiment",
     "positions",
@@ -76,6 +79,7 @@ def write_report(out: Path, folders: Sequence[Path]) -> list[Path]:
     """
     campaigns: dict[str, Results] = {}
     about: dict[str, dict[str, Any]] = {}
+    _require_own(out)
     for folder in folders:
         require_campaign(folder)
         settings = json.loads((folder / "campaign.json").read_text(encoding="utf-8"))["settings"]
@@ -102,6 +106,18 @@ def write_report(out: Path, folders: Sequence[Path]) -> list[Path]:
     for name, text in written.items():
         (out / name).write_text(text, encoding="utf-8")
     return [out / name for name in (*tables, *written)]
+
+
+def _require_own(out: Path) -> None:
+    """Raise ValueError if a folder holds files of these names, but neither a campaign nor an earlier report."""
+    if (out / "campaign.json").exists():
+        return
+    report = out / "report.md"
+    if report.is_file():
+        first = report.read_bytes().partition(b"\n")[0].decode(errors="replace")
+        if first in [f"# {title}" for title in _TITLES]:
+            return
+    require_no_others(out, REPORT_FILES)
 
 
 def require_campaign(folder: Path) -> None:
@@ -206,7 +222,7 @@ def _runs(campaigns: Mapping[str, Results], about: Mapping[str, Mapping[str, Any
 
 
 def _title(found: Sequence[Claim]) -> str:
-    return "The paper, reproduced" if found else "The paper's experiments with other arrays"
+    return _TITLES[0] if found else _TITLES[1]
 
 
 def _medians(results: Results) -> Table:

@@ -58,7 +58,7 @@ def draw(site: Site, path: Path) -> None:
     for index, spec in enumerate(shown):
         _enlarged(figure.add_subplot(grid[2 + index // COLUMNS, index % COLUMNS]), spec)
     figure.suptitle(f"{site.site}: room {x:g} x {y:g} x {z:g} m", color=_INK)
-    figure.savefig(path, dpi=110)
+    figure.savefig(path, dpi=110, metadata={"Software": "livessl"})
 
 
 def _view(ax: Axes, site: Site, axes: tuple[int, int], title: str) -> None:

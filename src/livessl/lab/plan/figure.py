@@ -89,7 +89,7 @@ def draw(plan: Plan, path: Path) -> None:
         f"{plan.site.site}: predicted position error at {plan.height_m:g} m height, RT60 {plan.rt60_s:g} s",
         color=_INK,
     )
-    figure.savefig(path, dpi=110)
+    figure.savefig(path, dpi=110, metadata={"Software": "livessl"})
 
 
 def _norm(all_errors: list[Errors]) -> Any:
