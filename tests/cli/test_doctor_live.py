@@ -16,7 +16,7 @@ from livessl.clock import SystemClock, UnpacedClock
 from livessl.core.types import Float32Array
 from livessl.recordings.assign import AssignedRecording
 from livessl.recordings.recording import MemoryRecording
-from livessl.schema.answers import Findings
+from livessl.schema.findings import Findings
 from livessl.server.app import Server
 from small_site import RATE_HZ, heard, running_server, site_of, wait_until
 

@@ -46,7 +46,7 @@ def test_sounds_of_another_session_are_an_error() -> None:
 def test_another_file_is_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "truth.jsonl"
     path.write_bytes(text.encode("latin-1"))
-    with pytest.raises(UseError, match="expected the truth.jsonl"):
+    with pytest.raises(UseError, match=r"expected the truth\.jsonl"):
         read_truth(path)
 
 

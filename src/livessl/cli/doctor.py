@@ -85,7 +85,7 @@ def _ask(url: str, token_file: Path | None) -> Examination:
     from livessl.core.commission.blind_spot import BlindSpot
     from livessl.core.commission.finding import Finding
     from livessl.examination import Examination
-    from livessl.schema.answers import Findings
+    from livessl.schema.findings import Findings
 
     answer = ask_for(Findings, url, "findings", token_file)
     findings = tuple(Finding(**one.model_dump(exclude={"kind"})) for one in answer.findings)

@@ -18,6 +18,7 @@ from livessl.core.commission.blind_spot import CURE, BlindSpot
 from livessl.core.types import FRAME_S
 from livessl.schema import answers
 from livessl.schema.answers import errors
+from livessl.schema.findings import Findings
 from livessl.server.api.auth import ACCESS, HEALTH, Access
 from livessl.server.api.encode import API_VERSION, JsonObject
 from livessl.server.api.png import map_png
@@ -122,7 +123,7 @@ def state_routes(parts: Parts) -> APIRouter:
         ]
         return as_json({"v": API_VERSION, "now_utc": now_utc, "arrays": arrays})
 
-    @router.get("/api/v1/findings", tags=["state"], response_model=answers.Findings)
+    @router.get("/api/v1/findings", tags=["state"], response_model=Findings)
     def get_findings() -> Response:
         """Faults of the set-up that the last sounds show, errors first, and faults that they would not show."""
         state = parts.set_up_watch.state

@@ -8,7 +8,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from livessl.core.commission.verification import SetUpVerdict
 from livessl.core.types import Status
-from livessl.schema.answers import Finding
+from livessl.schema.findings import Finding
 from livessl.schema.values import PositionM, UtcTime, Version
 
 MOST_CLAPS = 64
