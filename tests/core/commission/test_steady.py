@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 from hypothesis import given
@@ -67,3 +68,10 @@ def test_faults_of_channels_are_independent_of_the_set_up() -> None:
     assert published(([TURNED, DEAD], 3), ([MOVED, DEAD], 3)) == (DEAD, MOVED)
     assert published(([TURNED, DEAD], 3), ([TURNED, LEVEL], 1)) == (TURNED, DEAD)
     assert published(([TURNED, DEAD], 3), ([TURNED, LEVEL], 3)) == (TURNED, LEVEL)
+
+
+def test_unsure_finding_of_several_sounds_must_come_again() -> None:
+    unsure = replace(TURNED, confidence=0.5)
+    assert published(([unsure], 3)) == ()
+    assert published(([unsure], 3), ([], 1), ([unsure], 1)) == ()
+    assert published(([unsure], 3), ([unsure], 1)) == (unsure,)

@@ -14,6 +14,10 @@ CONFIRMING_SOUNDS: Final = 2
 MOST_CONFIRMING: Final = 6
 """Most confirming sounds that count, so that a finding ends soon after the set-up has been mended."""
 
+UNSURE: Final = 0.5
+"""Confidence up to which a finding must come again before it is published, however many sounds it is of: the echo of a
+single sound may cause a contradiction that nothing explains."""
+
 _SIGNAL: Final = frozenset({"dead", "deaf", "duplicate", "level"})
 """Faults of a channel's signal, of which a channel has at most one."""
 
@@ -43,9 +47,11 @@ class _Question:
         self.support -= sounds
         if self.support <= 0:
             self.published, self.support = (), 0
-        if _identity(answer) != _identity(self.rival):
-            self.rival_support = 0
-        self.rival, self.rival_support = answer, self.rival_support + sounds
+        is_new = _identity(answer) != _identity(self.rival)
+        if is_new and all(finding.confidence <= UNSURE for finding in answer):
+            sounds = 1  # the latest one alone may have caused it
+        self.rival_support = sounds if is_new else self.rival_support + sounds
+        self.rival = answer
         if answer and not self.published and self.rival_support >= CONFIRMING_SOUNDS:
             self.published, self.support = answer, min(self.rival_support, MOST_CONFIRMING)
             self.rival, self.rival_support = (), 0
@@ -59,9 +65,9 @@ class _Question:
 class SteadyFindings:
     """Decides which findings are published while examinations follow each other, each with some more sounds.
 
-    A finding is published after `CONFIRMING_SOUNDS` sounds, and ends after as many sounds without it as there were with
-    it, at most `MOST_CONFIRMING`. What is wrong with the order of channels and the poses is one question: its answers
-    exclude each other, and another one is published after the first has ended.
+    A finding is published after `CONFIRMING_SOUNDS` sounds, an unsure one after as many examinations. It ends after as
+    many sounds without it as there were with it, at most `MOST_CONFIRMING`. What is wrong with the order of channels
+    and the poses is one question: its answers exclude each other, and another one is published after the first has ended.
     """
 
     def __init__(self) -> None:
