@@ -21,7 +21,7 @@ INPUTS = st.permutations(RECORDED)
 
 def session_of(directory: Path, inputs: list[int], channels: int = 4) -> Path:
     directory.mkdir(exist_ok=True)
-    write_wav(directory / "north.wav", np.zeros((channels, RATE_HZ // 10), dtype=np.float32))
+    write_wav(directory / "north.wav", np.full((channels, RATE_HZ // 10), 0.1, dtype=np.float32))
     write_session(directory, site_of({NORTH: inputs}), [piece("north", "north.wav", 0)])
     return directory
 
