@@ -79,7 +79,10 @@ def test_every_command_prints_all_faults_of_the_site(run: Run, tmp_path: Path, c
 def test_missing_site_file_is_an_error(run: Run, tmp_path: Path) -> None:
     done = run("serve", "--site", tmp_path / "site.yaml")
     assert done.code == 2
-    assert done.err == f"livessl: error: {tmp_path / 'site.yaml'}: cannot be read: No such file or directory\n"
+    assert done.err == (
+        f"livessl: error: {tmp_path / 'site.yaml'}: cannot be read: No such file or directory; "
+        "correct the name, or make a site file with `livessl init`\n"
+    )
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from livessl.errors import did_you_mean
 from small_site import write_site
 
 
+@settings(max_examples=20)
 @given(word=st.sampled_from(COMMANDS), data=st.data())
 def test_a_doubled_letter_is_seen_through(word: str, data: st.DataObject) -> None:
     at = data.draw(st.integers(0, len(word) - 1))

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from livessl.errors import DeviceError
@@ -31,6 +31,7 @@ def directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return session_of(tmp_path_factory.mktemp("session"), RECORDED)
 
 
+@settings(max_examples=10)
 @given(inputs=INPUTS)
 def test_channels_are_taken_in_the_order_of_the_site_file(directory: Path, inputs: list[int]) -> None:
     session = read_session(directory)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
 from typing import Any, NoReturn
 
 from livessl.cli.exits import WRONG_USE
@@ -20,7 +19,7 @@ class Parser(argparse.ArgumentParser):
         complain(f"{message}{'' if message.endswith('?') else ';'} see {self.prog} --help")
         sys.exit(WRONG_USE)
 
-    def parse_known_args(self, args: Sequence[str] | None = None, namespace: Any = None) -> tuple[Any, list[str]]:  # type: ignore[override]
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """Parse; the parser of a command, which knows its options, refuses those that it does not know."""
         found, rest = super().parse_known_args(args, namespace)
         if rest:
