@@ -108,9 +108,9 @@ def test_finding_ends_when_the_set_up_is_mended(desk: Desk) -> None:
 
 def test_contradiction_without_a_culprit_concerns_all_arrays_and_a_warning_none(desk: Desk) -> None:
     desk.hear([CONTRADICTION, WEAK], LEAST_SOUNDS)
-    assert desk.watch.state.findings == (WEAK,)  # of so few sounds, a single one may contradict
+    assert list(desk.watch.state.findings) == [WEAK]  # of so few sounds, a single one may contradict
     desk.hear([CONTRADICTION, WEAK], 1)
-    assert desk.watch.state.findings == (CONTRADICTION, WEAK)
+    assert list(desk.watch.state.findings) == [CONTRADICTION, WEAK]
     assert set(desk.watch.state.errors) == {"north", "south"}
 
 

@@ -57,7 +57,6 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.out is not None:
         figure.require_matplotlib()
         _refuse_foreign(arguments.out, arguments.site)
-        make_folder(arguments.out, "--out")
     try:
         with progress.counted("trying positions", "array") as bar:
             plan = design.make_plan(site, arguments.rt60, arguments.height, arguments.calibration, bar)
@@ -66,6 +65,7 @@ def run(arguments: argparse.Namespace) -> int:
         return WRONG_USE
     result = words.as_json(plan)
     if arguments.out is not None:
+        make_folder(arguments.out, "--out")
         (arguments.out / "plan.json").write_text(json.dumps(result, allow_nan=False) + "\n", encoding="utf-8")
         figure.draw(plan, arguments.out / "plan.png")
     print(json.dumps(result, allow_nan=False) if arguments.json else words.as_text(plan))

@@ -194,8 +194,8 @@ def test_wrong_numbers(tmp_path: Path, option: tuple[str, str]) -> None:
 
 def test_out_that_is_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "plan").write_text("", encoding="utf-8")
-    assert main(planned(tmp_path, None, "--out", str(tmp_path / "plan"))) == 1
-    assert "plan" in capsys.readouterr().err
+    assert main(planned(tmp_path, None, "--out", str(tmp_path / "plan"))) == 2
+    assert "expected a folder, got a file" in capsys.readouterr().err
 
 
 FLAT = {"geometry": {"circle": {"radius_m": 0.1, "count": 4}}, "position_m": [2.0, 2.5, 1.2]}

@@ -67,7 +67,8 @@ class SteadyFindings:
 
     A finding is published after `CONFIRMING_SOUNDS` sounds, an unsure one after as many examinations. It ends after as
     many sounds without it as there were with it, at most `MOST_CONFIRMING`. What is wrong with the order of channels
-    and the poses is one question: its answers exclude each other, and another one is published after the first has ended.
+    and the poses is one question: its answers exclude each other, and another one is published after the first has
+    ended.
     """
 
     def __init__(self) -> None:
