@@ -204,6 +204,8 @@ def test_a_line_is_warned_about_also_in_a_search_plane() -> None:
         ("edge_m:", "edge:"),
         ("edge_m:", "egde_m:"),
         ("edge_m:", "edge_mm:"),
+        ("room:", "rooms:"),
+        ("arrays:", "arays:"),
     ],
 )
 def test_a_misspelt_key_is_one_fault_although_the_right_one_is_missing(right: str, wrong: str) -> None:

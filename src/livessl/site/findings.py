@@ -190,23 +190,24 @@ def duplicate_keys(node: yaml.Node | None, place: Place = ()) -> Iterator[Findin
             yield from duplicate_keys(value, here)
 
 
-def validation_findings(model: type[BaseModel], errors: Iterable[Mapping[str, Any]]) -> list[Finding]:
+def validation_findings(model: type[BaseModel], errors: Sequence[Mapping[str, Any]]) -> list[Finding]:
     """Return pydantic's errors for a file that `model` describes, each as one sentence."""
     found: list[Finding] = []
-    missing: dict[Place, Finding] = {}
     for error in errors:
-        place = tuple(part for part in error["loc"] if part != "[key]")
-        if error["type"] == "extra_forbidden":
-            found.append((place, _unknown_key(model, place)))
-        else:
-            found.append((place, _sentence(error)))
-        if error["type"] == "missing":
-            missing[place] = found[-1]
-    for place, what in list(found):  # a key that is misspelt is missing, too: one slip is one fault
-        meant = _MEANT.search(what)
-        if meant is not None and (there := missing.pop((*place[:-1], meant[1]), None)) is not None:
-            found.remove(there)
-    return found
+        place = _place_of(error)
+        found.append((place, _unknown_key(model, place) if error["type"] == "extra_forbidden" else _sentence(error)))
+    return one_for_each_slip(found, errors)
+
+
+def one_for_each_slip(findings: Sequence[Finding], errors: Iterable[Mapping[str, Any]]) -> list[Finding]:
+    """Leave out that a key is missing where another finding says that it is misspelt; `errors` are pydantic's."""
+    missing = {_place_of(error) for error in errors if error["type"] == "missing"}
+    misspelt = {(*place[:-1], meant[1]) for place, what in findings if (meant := _MEANT.search(what)) is not None}
+    return [finding for finding in findings if finding[0] not in missing & misspelt]
+
+
+def _place_of(error: Mapping[str, Any]) -> Place:
+    return tuple(part for part in error["loc"] if part != "[key]")
 
 
 def unknown_key(key: str, known: Iterable[str], elsewhere: Iterable[str] = ()) -> str:

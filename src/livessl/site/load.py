@@ -17,6 +17,7 @@ from livessl.site.findings import (
     Locator,
     duplicate_keys,
     nodes_of,
+    one_for_each_slip,
     places_of,
     reason,
     require_sane,
@@ -127,7 +128,7 @@ def _checked(data: Mapping[Any, Any], directory: Path) -> tuple[Site | None, lis
         file = SiteFile.model_validate(known, context=errors)
     except ValidationError as error:
         errors += error.errors()
-    findings += validation_findings(SiteFile, errors)
+    findings = one_for_each_slip([*findings, *validation_findings(SiteFile, errors)], errors)
     if file is None or not file.arrays:
         return None, findings
     site, faults = build_site(file, directory)
