@@ -29,7 +29,7 @@ UNTIL_STDIN_ENDS: Final = "--until-stdin-ends"
 """Argument that makes the command end when its standard input is closed: a killed server cannot stop it."""
 
 NICENESS: Final = 10
-"""Niceness of the compiler, as of nice(1), so that the server comes first."""
+"""Niceness of a compiler that a server has started, as of nice(1), so that the server comes first."""
 
 _log = logging.getLogger(__name__)
 
@@ -116,7 +116,7 @@ def main() -> None:
     """Compile the kernels and note that it was done; what another process compiles already is waited for."""
     if UNTIL_STDIN_ENDS in sys.argv[1:]:
         threading.Thread(target=_end_with_stdin, name="parent", daemon=True).start()
-    os.nice(NICENESS)
+        os.nice(NICENESS)
     stamp = _stamp(kernels.in_use)
     if stamp is None:
         warm_up()
