@@ -206,9 +206,11 @@ class Room:
     Parameters
     ----------
     seed : int
+    recordings : Recordings or None
+        What the arrays of the faultless set-up record; None to render it when it is needed.
     """
 
-    def __init__(self, seed: int) -> None:
+    def __init__(self, seed: int, recordings: Recordings | None = None) -> None:
         self.seed = seed
         rng = np.random.default_rng([seed, 1])
         self._size_m = [round(float(side), 2) for side in rng.uniform([6.0, 7.0, 2.8], [10.0, 12.0, 4.4])]
@@ -220,7 +222,7 @@ class Room:
             along_m, z_m, yaw_deg = rng.uniform([-0.8, 1.5, -180.0], [0.8, 2.3, 180.0])
             at_m = (x_m, y_m + along_m, z_m) if name == "west" else (x_m + along_m, y_m, z_m)
             self._filed[name] = posed(tetrahedron(0.5), at_m, yaw_deg=float(yaw_deg))
-        self._recordings: Recordings | None = None
+        self._recordings = recordings
 
     @cached_property
     def scene(self) -> Scene:

@@ -20,10 +20,8 @@ BY_NAME = {fault.name: fault for fault in FAULTS}
 
 def room(seed: int) -> Room:
     """A room whose recordings are noise: nothing is rendered."""
-    made = Room(seed)
     rng = np.random.default_rng(seed)
-    made._recordings = {name: (0.01 * rng.standard_normal((4, 4800))).astype(np.float32) for name in ARRAYS}
-    return made
+    return Room(seed, {name: (0.01 * rng.standard_normal((4, 4800))).astype(np.float32) for name in ARRAYS})
 
 
 def finding(fault: str, array: str | None, channel: int | None = None, confidence: float = 0.99) -> Finding:

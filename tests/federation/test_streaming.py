@@ -24,6 +24,7 @@ from nats.js.api import ConsumerInfo, SequenceInfo
 from hub_desk import SiteDesk, hub_site, ids_at, make_hub, running_hub, running_site, sounds
 from livessl.clock import SystemClock
 from livessl.federation.archive import Archive
+from livessl.federation.config import Hub
 from livessl.federation.intake import BATCH, Intake, RefusedError
 from livessl.federation.standstill import STANDSTILL_S, Standstill
 from livessl.server.forwarding.outbox import Outgoing
@@ -75,30 +76,35 @@ class Waiting:
 
 
 @pytest.fixture
-def intake(tmp_path: Path) -> Any:
+def parts(tmp_path: Path) -> Iterator[tuple[Hub, Archive]]:
     hub = make_hub("hub.sqlite", ["nats://127.0.0.1:1"], tmp_path)
     archive = Archive(hub.database, SystemClock())
-    yield Intake(hub, archive, SystemClock())
+    yield hub, archive
     archive.close()
 
 
-def test_intake_ends_whole_although_its_connection_loses_cancellations(intake: Any) -> None:
+@pytest.fixture
+def intake(parts: tuple[Hub, Archive]) -> Any:
+    return Intake(*parts, SystemClock())
+
+
+def test_intake_ends_whole_although_its_connection_loses_cancellations(parts: tuple[Hub, Archive]) -> None:
     lost, left = 0, False
 
-    async def receive() -> None:
-        nonlocal lost, left
-        try:
-            for _ in range(3):
-                with suppress(asyncio.CancelledError):
-                    await asyncio.sleep(1000)
-                lost += 1
-            await asyncio.sleep(1000)
-        finally:
-            left = True
+    class LosingIntake(Intake):
+        async def _receive(self) -> None:
+            nonlocal lost, left
+            try:
+                for _ in range(3):
+                    with suppress(asyncio.CancelledError):
+                        await asyncio.sleep(1000)
+                    lost += 1
+                await asyncio.sleep(1000)
+            finally:
+                left = True
 
     async def work() -> None:
-        intake._receive = receive
-        running = asyncio.create_task(intake.run())
+        running = asyncio.create_task(LosingIntake(*parts, SystemClock()).run())
         await asyncio.sleep(0.01)
         await ended(running)
         assert (lost, left) == (3, True)
