@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
@@ -10,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from clip_desk import head, recordings
@@ -202,14 +203,98 @@ def test_unreadable_clip_is_replaced_and_what_was_kept_stays_kept(tmp_path: Path
 
 @pytest.mark.parametrize("by_age", [True, False])
 def test_unreadable_clips_outlive_a_restart_and_are_deleted_by_age_and_size(tmp_path: Path, by_age: bool) -> None:
-    damaged(ClipFolder(tmp_path), tmp_path, b"{}")
+    content = b'{"keep": false}'
+    damaged(ClipFolder(tmp_path), tmp_path, content)
     os.utime(tmp_path / "lab-1" / "clip.json", ns=(7, 7))
     again = ClipFolder(tmp_path)
     again.load()
-    assert (again.count, again.unreadable, again.nbytes) == (1, 1, len(SOUND) + len(b"{}"))
+    assert (again.count, again.unreadable, again.nbytes) == (1, 1, len(SOUND) + len(content))
     limits = (7, again.nbytes), (8, again.nbytes) if by_age else (7, again.nbytes - 1)
     assert [again.expire(*limit) for limit in limits] == [0, 1]
     assert on_disk(tmp_path) == set()
+
+
+def refused_file(name: str, number: int) -> Any:
+    """Stands in for `Path.open`: the system refuses the file about one clip."""
+    real = Path.open
+
+    def opened(path: Path, *how: Any, **more: Any) -> Any:
+        if path.parent.name == name and path.name == "clip.json":
+            raise OSError(number, os.strerror(number))
+        return real(path, *how, **more)
+
+    return opened
+
+
+CUT_SHORT = st.integers(0, 27).map(lambda length: b'{"keep": false, "start_ns": 5'[:length])
+KEPT = st.dictionaries(st.sampled_from(["start_ns", "files"]), st.none(), max_size=1).map(
+    lambda about: json.dumps({**about, "keep": True}).encode()
+)
+
+
+@settings(max_examples=25)
+@given(content=st.sampled_from([content for content, _ in UNREADABLE.values()]) | CUT_SHORT | KEPT)
+def test_no_unreadable_clip_that_may_be_kept_is_deleted_after_a_restart(
+    tmp_path_factory: pytest.TempPathFactory, content: bytes
+) -> None:
+    path = tmp_path_factory.mktemp("clips")
+    (path / "lab-1").mkdir()
+    (path / "lab-1" / "clip.json").write_bytes(content)
+    again = ClipFolder(path)
+    again.load()
+    assert again.expire(1 << 62, -1) == 0
+    assert (on_disk(path), again.kept_bytes) == ({"lab-1/clip.json"}, len(content))
+
+
+@pytest.mark.parametrize(("content", "keep"), [(b"", True), (b'{"keep": true}', True), (b'{"keep": false}', False)])
+def test_clip_that_replaces_an_unreadable_one_is_kept_if_that_may_be(
+    tmp_path: Path, content: bytes, keep: bool
+) -> None:
+    damaged(ClipFolder(tmp_path), tmp_path, content)
+    again = ClipFolder(tmp_path)
+    again.load()
+    assert again.put("lab-1", write(6)).keep is keep
+
+
+@pytest.mark.parametrize("number", [errno.EMFILE, errno.EIO, errno.EACCES])
+def test_clip_that_the_disk_refuses_at_the_start_is_left_alone_and_counts_once_it_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, number: int
+) -> None:
+    first = ClipFolder(tmp_path)
+    for name in ("lab-1", "lab-2", "lab-3"):
+        first.put(name, write(5))
+    first.keep("lab-1", True)
+    again = ClipFolder(tmp_path)
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "open", refused_file("lab-1", number))
+        again.load()
+        assert (again.count, again.kept, again.unreadable, again.expire(10, 0)) == (3, 0, 1, 2)
+        with pytest.raises(UnreadableClipError, match=r"be read: .*; correct its permissions, the disk") as caught:
+            again.read("lab-1")
+        assert os.strerror(number) in str(caught.value)
+        assert "delete" not in str(caught.value)
+    assert again.expire(10, 0) == 0  # it reads the clip again
+    assert (again.count, again.kept, again.unreadable, again.nbytes) == (1, 1, 0, len(SOUND))
+    assert caplog.text.count("clip.json cannot be read") == 1
+    again.keep("lab-1", False)
+    assert again.expire(10, 0) == 1
+
+
+def test_clip_whose_folder_is_refused_at_the_start_counts_once_it_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ClipFolder(tmp_path).put("lab-1", write(5))
+    again = ClipFolder(tmp_path)
+
+    def refused(folder: Path) -> Any:
+        raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(again, "_entry", refused)
+        again.load()
+        assert again.count == 0
+    assert again.read("lab-1") is not None
+    assert (again.count, again.kept, again.expire(10, 0)) == (1, 0, 1)
 
 
 def test_clip_that_could_not_be_read_again_is_not_stored(tmp_path: Path) -> None:

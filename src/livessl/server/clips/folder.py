@@ -11,13 +11,22 @@ import shutil
 import threading
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
 import orjson
 
-from livessl.server.clips.reader import ABOUT, SAFE, Clip, ClipReader, ClipsError, UnreadableClipError, parsed
+from livessl.server.clips.reader import (
+    ABOUT,
+    SAFE,
+    Clip,
+    ClipDiskError,
+    ClipReader,
+    ClipsError,
+    UnreadableClipError,
+    parsed,
+)
 
 PARTIAL: Final = ".partial-"
 """Beginning of the name of a folder that is being written or deleted."""
@@ -28,11 +37,16 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class _Entry:
-    """The properties of a clip that retention needs."""
+    """The properties of a clip that retention needs; `keep` is None while nobody can know it."""
 
     start_ns: int
     nbytes: int
-    keep: bool
+    keep: bool | None
+
+    @property
+    def stays(self) -> bool:
+        """Whether neither age nor room deletes the clip; one that may be kept for ever is treated as if it were."""
+        return self.keep is not False
 
 
 class ClipFolder(ClipReader):
@@ -55,6 +69,7 @@ class ClipFolder(ClipReader):
         self._erasing = threading.Lock()  # is never held while waiting for the other lock
         self._entries: dict[str, _Entry] = {}
         self._unreadable: dict[str, str] = {}  # reasons
+        self._unread: set[str] = set()  # clips that the disk has refused, and are tried again
         try:
             path.mkdir(mode=0o700, parents=True, exist_ok=True)
             probe = path / f"{PARTIAL}probe"
@@ -69,8 +84,8 @@ class ClipFolder(ClipReader):
     def load(self) -> None:
         """Read what is there, and delete what a killed server has left unfinished; what fails is left, and logged.
 
-        Unreadable clips count with the size of their files and the time of `clip.json`, so that age and room delete
-        them, too.
+        Unreadable clips count with the size of their files and the time of `clip.json`. Age and room delete those that
+        say that they are not kept for ever; where that is unknown, they stay.
         """
         try:
             folders = sorted(self._path.iterdir())
@@ -81,6 +96,7 @@ class ClipFolder(ClipReader):
             try:
                 self._load(folder)
             except OSError as error:
+                self._unread.add(folder.name)
                 _log.warning(
                     "%s: cannot be read or deleted: %s; correct its permissions or delete it",
                     folder,
@@ -88,6 +104,7 @@ class ClipFolder(ClipReader):
                 )
 
     def _load(self, folder: Path) -> None:
+        """Finish what is being deleted, or enter a clip; one that the disk refuses is tried again by `expire`."""
         if folder.name.startswith(PARTIAL):
             self._finish(folder)
         elif folder.is_dir():
@@ -98,29 +115,49 @@ class ClipFolder(ClipReader):
             _log.warning("%s: expected a clip with %s, got none; it is left alone", folder, ABOUT)
 
     def _entry(self, folder: Path) -> _Entry:
+        keep: bool | None = None
         try:
             clip = self.read(folder.name)
-        except UnreadableClipError:
-            clip = None
+        except UnreadableClipError as error:
+            clip, keep = None, error.keep
         if clip is not None:
-            return _Entry(clip.start_ns, clip.nbytes, clip.keep)
+            return _entry_of(clip)
         sizes = [path.stat().st_size for path in folder.iterdir()]
-        return _Entry((folder / ABOUT).stat().st_mtime_ns, sum(sizes), keep=False)
+        return _Entry((folder / ABOUT).stat().st_mtime_ns, sum(sizes), keep)
 
     def read(self, event_id: str) -> Clip | None:
-        """Return an event's clip as `ClipReader` does; one that is unreadable is counted, and logged once."""
+        """Return an event's clip as `ClipReader` does; one that is unreadable is counted, and logged once.
+
+        A clip that could not be read before counts from now on as it says itself.
+        """
         try:
             clip = super().read(event_id)
         except UnreadableClipError as error:
             with self._lock:
                 is_known = self._unreadable.get(event_id) == str(error)
                 self._unreadable[event_id] = str(error)
+                self._note_unreadable(event_id, error)
             if not is_known:
                 _log.warning("server.clips.folder: %s", error)
             raise
-        with self._lock:
-            self._unreadable.pop(event_id, None)
+        if event_id in self._unreadable or (clip is not None and event_id not in self._entries):
+            with self._lock:
+                clip = super().read(event_id)  # it may have been kept, replaced or deleted just before
+                self._unreadable.pop(event_id, None)
+                self._unread.discard(event_id)
+                if clip is not None:
+                    self._entries[event_id] = _entry_of(clip)
         return clip
+
+    def _note_unreadable(self, event_id: str, error: UnreadableClipError) -> None:
+        """Note whether to try again, and what is known of whether the clip is kept; the lock is held."""
+        if isinstance(error, ClipDiskError):
+            self._unread.add(event_id)
+            return
+        self._unread.discard(event_id)
+        entry = self._entries.get(event_id)
+        if entry is not None and entry.keep is None:
+            self._entries[event_id] = replace(entry, keep=error.keep)
 
     @property
     def unreadable(self) -> int:
@@ -142,16 +179,16 @@ class ClipFolder(ClipReader):
     def kept(self) -> int:
         """Number of clips that are kept for ever."""
         with self._lock:
-            return sum(entry.keep for entry in self._entries.values())
+            return sum(entry.keep is True for entry in self._entries.values())
 
     @property
     def kept_bytes(self) -> int:
-        """Bytes of the clips that are kept for ever."""
+        """Bytes of the clips that neither age nor room deletes: they are kept for ever, or may be."""
         with self._lock:
-            return sum(entry.nbytes for entry in self._entries.values() if entry.keep)
+            return sum(entry.nbytes for entry in self._entries.values() if entry.stays)
 
     def put(self, event_id: str, write: Callable[[Path], Mapping[str, Any]]) -> Clip:
-        """Store a clip in place of an earlier one of the same event, which stays kept for ever if it was.
+        """Store a clip in place of an earlier one of the same event; it is kept for ever if that one was, or may be.
 
         Parameters
         ----------
@@ -180,7 +217,7 @@ class ClipFolder(ClipReader):
                 clip = self._written(partial / ABOUT, event_id, about | {"keep": self._is_kept(event_id)})
                 going = self._set_aside(event_id)
                 partial.rename(clip.path)
-                self._entries[event_id] = _Entry(clip.start_ns, clip.nbytes, clip.keep)
+                self._entries[event_id] = _entry_of(clip)
         except BaseException:
             with suppress(OSError):
                 _erase(partial)
@@ -205,7 +242,7 @@ class ClipFolder(ClipReader):
             fresh = clip.path / f"{PARTIAL}{ABOUT}"
             clip = self._written(fresh, event_id, {**clip.content, "keep": keep})
             fresh.replace(clip.path / ABOUT)
-            self._entries[event_id] = _Entry(clip.start_ns, clip.nbytes, keep)
+            self._entries[event_id] = _entry_of(clip)
             return True
 
     def _written(self, path: Path, event_id: str, about: Mapping[str, Any]) -> Clip:
@@ -218,9 +255,10 @@ class ClipFolder(ClipReader):
     def _is_kept(self, event_id: str) -> bool:
         try:
             clip = self.read(event_id)
-        except UnreadableClipError:
+        except UnreadableClipError as error:
             entry = self._entries.get(event_id)
-            return entry is not None and entry.keep
+            said = {error.keep, None if entry is None else entry.keep}
+            return True in said or False not in said
         return clip is not None and clip.keep
 
     def delete(self, event_id: str) -> bool:
@@ -256,14 +294,16 @@ class ClipFolder(ClipReader):
     def expire(self, before_ns: int | None, most_bytes: int) -> int:
         """Delete clips of events that began before a time, and the oldest ones beyond a number of bytes.
 
-        Clips that are kept for ever stay. Clips whose folders somebody has removed do not count any more. Return the
-        number of clips that were deleted.
+        Clips that are kept for ever stay, and unreadable ones of which that cannot be known. Those that the disk has
+        refused are read again first. Clips whose folders somebody has removed do not count any more. Return the number
+        of clips that were deleted.
 
         Raises
         ------
         OSError
             If a file cannot be deleted; the other clips are.
         """
+        self._try_again()
         with self._lock:
             self._forget_removed()
             excess = self.nbytes - most_bytes
@@ -271,7 +311,7 @@ class ClipFolder(ClipReader):
         gone, failed = 0, None
         for event_id, entry in oldest_first:
             is_old = before_ns is not None and entry.start_ns < before_ns
-            if not entry.keep and (is_old or excess > 0):
+            if not entry.stays and (is_old or excess > 0):
                 try:
                     going = self._set_aside(event_id, entry)
                     if going is None:  # it was kept, replaced or deleted meanwhile
@@ -298,7 +338,14 @@ class ClipFolder(ClipReader):
             (self._path / event_id).rename(going)
             self._entries.pop(event_id, None)
             self._unreadable.pop(event_id, None)
+            self._unread.discard(event_id)
             return going
+
+    def _try_again(self) -> None:
+        """Read the clips again that the disk has refused; what fails still has been logged, and is left alone."""
+        for event_id in sorted(self._unread):
+            with suppress(OSError, UnreadableClipError):
+                self.read(event_id)
 
     def _forget_removed(self) -> None:
         """Forget the clips whose folders are gone; the lock is held, so that none of them is just being replaced."""
@@ -306,11 +353,16 @@ class ClipFolder(ClipReader):
         for known in (self._entries, self._unreadable):
             for event_id in known.keys() - there:
                 del known[event_id]
+        self._unread &= there
 
     def _finish(self, going: Path) -> None:
         """Erase a folder that was set aside; two threads may do so at once."""
         with self._erasing:
             _erase(going)
+
+
+def _entry_of(clip: Clip) -> _Entry:
+    return _Entry(clip.start_ns, clip.nbytes, clip.keep)
 
 
 def _write_through(path: Path, data: bytes) -> None:

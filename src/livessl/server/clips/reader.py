@@ -39,12 +39,30 @@ class UnreadableClipError(RunError):
     event_id : str
     what : str
         What is wrong, as the middle of a sentence.
+    keep : bool or None
+        Whether the file says that the recordings are kept for ever; None if that cannot be known.
     """
 
-    def __init__(self, event_id: str, what: str) -> None:
-        super().__init__(
+    def __init__(self, event_id: str, what: str, keep: bool | None = None) -> None:
+        super().__init__(self._text(event_id, what))
+        self.keep = keep
+
+    @staticmethod
+    def _text(event_id: str, what: str) -> str:
+        return (
             f"event {event_id!r}: expected a {ABOUT} that this release can read, got another one: {what}; it is "
             "damaged or of another release: locate its sound with `livessl locate --wav ARRAY=FILE`, or delete them"
+        )
+
+
+class ClipDiskError(UnreadableClipError):
+    """`clip.json` cannot be read from the disk; nothing is known of its content, and another attempt may succeed."""
+
+    @staticmethod
+    def _text(event_id: str, what: str) -> str:
+        return (
+            f"event {event_id!r}: {ABOUT} cannot be read: {what}; correct its permissions, the disk, or the limit of "
+            "open files; the recordings are left alone"
         )
 
 
@@ -124,7 +142,9 @@ class ClipReader:
         Raises
         ------
         UnreadableClipError
-            If `clip.json` is empty, cut short, damaged, of another release, or cannot be read.
+            If `clip.json` is empty, cut short, damaged or of another release.
+        ClipDiskError
+            If `clip.json` cannot be read from the disk.
         """
         if not SAFE.fullmatch(event_id):
             return None
@@ -135,7 +155,7 @@ class ClipReader:
         except (FileNotFoundError, NotADirectoryError, IsADirectoryError):
             return None
         except OSError as error:
-            raise UnreadableClipError(event_id, error.strerror or str(error)) from error
+            raise ClipDiskError(event_id, error.strerror or str(error)) from error
         return parsed(event_id, folder, data)
 
 
@@ -156,8 +176,14 @@ def parsed(event_id: str, folder: Path, data: bytes) -> Clip:
     except orjson.JSONDecodeError as error:
         raise UnreadableClipError(event_id, f"it is not JSON: {error}") from error
     except ValidationError as error:
-        raise UnreadableClipError(event_id, _first_fault(error)) from error
+        raise UnreadableClipError(event_id, _first_fault(error), _said_keep(content)) from error
     return Clip(event_id, folder, head.start_ns, head.keep, content)
+
+
+def _said_keep(content: Any) -> bool | None:
+    """Return whether a file of another form says that its recordings are kept for ever; None if it does not say."""
+    keep = content.get("keep") if isinstance(content, dict) else None
+    return keep if isinstance(keep, bool) else None
 
 
 def _first_fault(error: ValidationError) -> str:

@@ -188,8 +188,8 @@ class Clips:
         kept, most = self.folder.kept_bytes, self._config.max_bytes
         if kept > most:
             found.append(
-                f"server.clips.max_bytes: clips that are kept for ever take {kept / 1e6:.1f} MB of {most / 1e6:.1f} MB"
-                ", so that new ones are deleted; keep fewer, or raise it"
+                "server.clips.max_bytes: clips that are kept for ever, or may be as they are unreadable, take "
+                f"{kept / 1e6:.1f} MB of {most / 1e6:.1f} MB, so that new ones are deleted; keep fewer, or raise it"
             )
         return found
 
