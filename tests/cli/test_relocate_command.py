@@ -94,6 +94,7 @@ def test_failed_event_is_tried_again(run: Run, tmp_path: Path) -> None:
         ({"temperature_c": 31.0}, ()),
         ({"band_hz": [200.0, 4000.0]}, ()),
         ({"fusion.max_event_s": 7.0}, ()),
+        ({"uncertainty.position_m": 0.03}, ()),
         ({"grid.spacing_m": 0.3}, ()),
         ({}, ("--joint", "both=north,south")),
     ],

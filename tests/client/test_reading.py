@@ -42,7 +42,9 @@ def test_stored_events_of_older_releases_are_read(lacks: set[str], lacks_part: s
 
 
 def test_answer_that_cannot_be_read_is_an_error_of_the_run() -> None:
-    with pytest.raises(NewerServerError, match=r"^events/a: cannot read the answer: status: .*; update livessl"):
+    with pytest.raises(
+        NewerServerError, match=r"^events/a: cannot read the answer: status: .*; update the older of the two"
+    ):
         read_answer(OneEvent, json.dumps({"v": 1, **event_message(status="guessed")}), "events/a")
     with pytest.raises(ForeignAnswerError, match=r"^events/a: expected an answer in JSON.*check that the address"):
         read_answer(OneEvent, b"<!doctype html><title>Welcome</title>", "events/a")

@@ -8,8 +8,10 @@ from __future__ import annotations
 import argparse
 import json
 import os
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+import shutil
+import tempfile
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
@@ -63,13 +65,15 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
     import_from_here()
     archive: Archive = _at_server(arguments) if arguments.url is not None else _in_folder(arguments)
-    wanted = archive.ids(arguments.since, arguments.until)
+    held = [] if arguments.out is None else _read_answers(arguments.out, archive)  # a wrong file is refused at once
+    known = {answer.event_id for answer in held if answer.is_located}
+    wanted = archive.ids(arguments.since, arguments.until, known)
     if not wanted:
         complain(f"{archive.place}: no event of that span has recordings", kind="note")
     distances_m: list[float] = []
     failed = 0
     with (
-        _answers(arguments.out, archive, wanted) as (known, keep),
+        _answers(arguments.out, held, frozenset(wanted)) as keep,
         progress.counted("locating", "event") as bar,
     ):
         missing = [name for name in wanted if name not in known]
@@ -110,8 +114,11 @@ class Archive(Protocol):
         """The folder or the address."""
         ...
 
-    def ids(self, since_ns: int | None, until_ns: int | None) -> list[str]:
-        """Return the ids of the events of a span that have recordings, which may be unreadable."""
+    def ids(self, since_ns: int | None, until_ns: int | None, known: Collection[str] = ()) -> list[str]:
+        """Return the ids of the events of a span that have recordings, which may be unreadable.
+
+        Events of which that is `known` need not be looked up.
+        """
         ...
 
     def relocate(self, event_ids: Sequence[str]) -> Iterator[dict[str, Any]]:
@@ -172,7 +179,7 @@ class _FolderArchive:
     def place(self) -> str:
         return str(self.task.folder)
 
-    def ids(self, since_ns: int | None, until_ns: int | None) -> list[str]:
+    def ids(self, since_ns: int | None, until_ns: int | None, known: Collection[str] = ()) -> list[str]:  # noqa: ARG002
         from livessl.server.clips.reader import ClipReader, ClipsError
 
         clips = ClipReader(self.task.folder)
@@ -211,58 +218,85 @@ def _is_in_span(folder: ClipReader, event_id: str, since_ns: int | None, until_n
     return is_after and (until_ns is None or clip.start_ns <= until_ns)
 
 
-@contextmanager
-def _answers(path: Path | None, task: Archive, wanted: Sequence[str]) -> Iterator[tuple[set[str], Any]]:
-    """Open the file of answers; yield the ids of the events that were located, and a function that appends an answer.
+@dataclass(frozen=True, slots=True)
+class _Answer:
+    """A line of a file of answers: the event that it is about, and whether that was located."""
 
-    What the file says of wanted events that could not be located is removed, because they are tried again.
+    event_id: str
+    is_located: bool
+    line: bytes
+
+
+def _read_answers(path: Path, task: Archive) -> list[_Answer]:
+    """Return the answers in a file, which is created if it is not there.
 
     Raises
     ------
     UseError
         If it has answers of another method, set-up or calibration, or something else, or cannot be read or written.
     """
+    held: list[_Answer] = []
+    try:
+        with path.open("ab"):
+            pass
+        lines = path.read_bytes().splitlines(keepends=True)
+    except OSError as error:
+        raise _unwritable(path, error) from error
+    for line in lines:
+        if not line.endswith(b"\n") and is_begun(line):  # a command that was killed has left it; it is written again
+            break
+        held.append(_held(path, line, task))
+    return held
+
+
+@contextmanager
+def _answers(
+    path: Path | None, held: Sequence[_Answer], wanted: frozenset[str]
+) -> Iterator[Callable[[dict[str, Any]], None]]:
+    """Open the file of answers; yield a function that appends an answer.
+
+    What the file says of wanted events that could not be located is removed, because they are tried again.
+
+    Raises
+    ------
+    UseError
+        If the file cannot be written.
+    """
     if path is None:
-        yield set(), lambda _: None
+        yield lambda _: None
         return
     try:
-        known = _sorted_out(path, task, frozenset(wanted)) if path.exists() else set()
+        content = b"".join(answer.line for answer in held if answer.is_located or answer.event_id not in wanted)
+        if content != path.read_bytes():
+            _replace(path.resolve(), content)
         opened = path.open("ab")
     except OSError as error:
-        raise UseError(f"--out {path}: expected a file that can be written: {error.strerror or error}") from error
+        raise _unwritable(path, error) from error
     with opened as file:
 
         def keep(found: dict[str, Any]) -> None:
             file.write(json.dumps(found).encode() + b"\n")
             file.flush()
 
-        yield known, keep
+        yield keep
 
 
-def _sorted_out(path: Path, task: Archive, wanted: frozenset[str]) -> set[str]:
-    """Remove what a file of answers says of wanted events that could not be located; return the ids of those that were.
+def _unwritable(path: Path, error: OSError) -> UseError:
+    return UseError(f"--out {path}: expected a file that can be written: {error.strerror or error}")
 
-    Raises
-    ------
-    UseError
-        See `_answers`.
-    OSError
-        If the file cannot be read or written.
-    """
-    known: set[str] = set()
-    kept: list[bytes] = []
-    for line in path.read_bytes().splitlines(keepends=True):
-        if not line.endswith(b"\n") and is_begun(line):  # a command that was killed has left it; it is written again
-            break
-        event_id, is_located = _held(path, line, task)
-        if is_located:
-            known.add(event_id)
-        if is_located or event_id not in wanted:
-            kept.append(line)
-    fresh = path.with_name(f"{path.name}.partial")
-    fresh.write_bytes(b"".join(kept))
-    fresh.replace(path)
-    return known
+
+def _replace(path: Path, content: bytes) -> None:
+    """Replace a file whole, by way of a new one of a random name in its folder; a link's target, not the link."""
+    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+    try:
+        with os.fdopen(handle, "wb") as fresh:
+            fresh.write(content)
+        shutil.copymode(path, name)
+        Path(name).replace(path)
+    except BaseException:
+        with suppress(OSError):
+            Path(name).unlink()
+        raise
 
 
 def is_begun(line: bytes) -> bool:
@@ -270,8 +304,8 @@ def is_begun(line: bytes) -> bool:
     return line[: len(BEGINNING)] == BEGINNING[: len(line)]
 
 
-def _held(path: Path, line: bytes, task: Archive) -> tuple[str, bool]:
-    """Return the id of the event that a line of the file of answers is about, and whether it was located.
+def _held(path: Path, line: bytes, task: Archive) -> _Answer:
+    """Return what a line of the file of answers is about.
 
     Raises
     ------
@@ -291,7 +325,7 @@ def _held(path: Path, line: bytes, task: Archive) -> tuple[str, bool]:
             f"--out: {path} has answers of another calibration, --joint, site file, server or release, which do not "
             "belong beside those of now; name another file"
         )
-    return str(event_id), is_located
+    return _Answer(str(event_id), is_located, line)
 
 
 def _print(found: dict[str, Any], *, as_json: bool) -> None:

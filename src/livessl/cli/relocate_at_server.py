@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 from urllib.parse import quote, urlencode
 
 from livessl.cli.output import complain
 from livessl.cli.server_answers import RefusedError, ask_for, order
-from livessl.clock import utc_text
-from livessl.schema.answers import EventPage, Site
-from livessl.schema.relocation import Relocated
+from livessl.clock import SystemClock, utc_text
+from livessl.errors import RunError, UseError
+from livessl.schema.answers import EventPage
+from livessl.schema.relocation import Relocated, RelocationSettings
 from livessl.schema.values import Event
 from livessl.server.api.clip_schema import EventClips
 
@@ -25,16 +24,26 @@ ANSWER_S: Final = 600.0
 PAGE: Final = 200
 """Events that are asked for at a time."""
 
-OF_ONE_EVENT: Final = (404, 409, 503)
-"""Statuses of answers that are about one event; after others, the next event would be refused as well."""
+BUSY_S: Final = 120.0
+"""Longest wait, in seconds, for a server that is overloaded, stopping, at another event, or without its database."""
 
-DECISIVE: Final = {"site", "version", "room", "grid", "speed_of_sound_m_s", "band_hz", "activity", "arrays", "joint"}
-"""Fields of `GET site` that decide the answers."""
+LONGEST_WAIT_S: Final = 10.0
+"""Longest time, in seconds, between two requests to a busy server."""
+
+FIRST_WAIT_S: Final = 1.0
+"""Time, in seconds, between the first two requests to a busy server; each further one is twice as long."""
+
+BUSY: Final = 503
+"""Status of the answers of a busy server."""
+
+OF_ONE_EVENT: Final = (404, 409)
+"""Statuses of answers that are about one event; after others, the next event would be refused as well."""
 
 ANSWERED: Final = {"moved_arrays", "stored", "again", "other_sources", "distance_m"}
 """Fields of the answer to `POST relocate` that are passed on."""
 
 JsonObject = dict[str, Any]
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -64,19 +73,49 @@ class ServerArchive:
 
     @cached_property
     def digest(self) -> str:
-        """Digest of method, set-up, and what the server says of its site and release."""
-        site = ask_for(Site, self.url, "site", self.token_file).model_dump(mode="json", include=DECISIVE)
-        return hashlib.sha256(json.dumps([self.method, self.set_up, site], sort_keys=True).encode()).hexdigest()[:16]
+        """Digest of the server's release and of all its settings that decide the answers, as the server computes it.
 
-    def ids(self, since_ns: int | None, until_ns: int | None) -> list[str]:
-        """Return the ids of the events that have recordings, oldest first; ask for each whether it has."""
+        Raises
+        ------
+        RunError
+            If the server is of a release that does not compute it.
+        """
+        wanted = {name: value for name, value in self._wanted.items() if value is not None}
+        path = f"relocation-settings?{urlencode(wanted)}"
+        try:
+            found = _patiently(lambda: ask_for(RelocationSettings, self.url, path, self.token_file)).digest
+        except RefusedError as error:
+            if error.status != 404:
+                raise
+            found = None
+        return self._stated(found)
+
+    @property
+    def _wanted(self) -> dict[str, str | None]:
+        return {"method": self.method, "set_up": self.set_up}
+
+    def _stated(self, digest: str | None) -> str:
+        if digest is None:
+            raise RunError(
+                f"{self.url}: expected a server that states a digest of its settings, got an earlier release; update it"
+            )
+        return digest
+
+    def ids(self, since_ns: int | None, until_ns: int | None, known: Collection[str] = ()) -> list[str]:
+        """Return the ids of the events that have recordings, oldest first; ask for each whether it has.
+
+        The events of which that is `known` are not asked for.
+        """
         found, recorded = self._located(since_ns, until_ns), []
         for event_id in reversed(found):
-            clips = ask_for(EventClips, self.url, f"events/{quote(event_id)}/clips", self.token_file)
-            recorded += [] if clips.state == "none" else [event_id]
+            recorded += [event_id] if event_id in known or self._has_clips(event_id) else []
         if missing := len(found) - len(recorded):
             complain(f"{missing} of {len(found)} located events have no recordings and are left out", kind="note")
         return recorded
+
+    def _has_clips(self, event_id: str) -> bool:
+        path = f"events/{quote(event_id)}/clips"
+        return _patiently(lambda: ask_for(EventClips, self.url, path, self.token_file)).state != "none"
 
     def _located(self, since_ns: int | None, until_ns: int | None) -> list[str]:
         """Return the ids of all located events, newest first."""
@@ -85,7 +124,8 @@ class ServerArchive:
         wanted |= {name: utc_text(time_ns) for name, time_ns in span.items() if time_ns is not None}
         found: list[str] = []
         while True:
-            page = ask_for(EventPage, self.url, f"events?{urlencode(wanted)}", self.token_file)
+            path = f"events?{urlencode(wanted)}"
+            page = _patiently(partial(ask_for, EventPage, self.url, path, self.token_file))
             found += [event.id for event in page.events]
             if page.next_cursor is None:
                 return found
@@ -97,7 +137,9 @@ class ServerArchive:
         Raises
         ------
         RefusedError
-            If the server would refuse every event.
+            If the server would refuse every event, or stays busy for `BUSY_S`.
+        UseError
+            If the server's settings have changed since the first answer.
         """
         for event_id in event_ids:
             yield self._relocate(event_id)
@@ -117,14 +159,46 @@ class ServerArchive:
             "distance_m": None,
             "error": None,
         }
-        wanted = {"method": self.method, "set_up": self.set_up}
         event = f"events/{quote(event_id)}"
         try:
-            about = ask_for(Event, self.url, event, self.token_file)
+            about = _patiently(lambda: ask_for(Event, self.url, event, self.token_file))
             found |= about.model_dump(mode="json", include={"time_utc"})
-            answer = order(Relocated, self.url, f"{event}/relocate", self.token_file, wanted, ANSWER_S)
+            answer = _patiently(
+                lambda: order(Relocated, self.url, f"{event}/relocate", self.token_file, self._wanted, ANSWER_S)
+            )
         except RefusedError as error:
             if error.status not in OF_ONE_EVENT:
                 raise
             return found | {"error": error.reason or str(error)}
+        if self._stated(answer.digest) != self.digest:
+            raise UseError(
+                f"relocate: expected the settings of the first answer at {self.url}, got others: poses, settings or "
+                "release have changed meanwhile; start again, with another --out"
+            )
         return found | answer.model_dump(mode="json", include=ANSWERED)
+
+
+def _patiently(ask: Callable[[], T]) -> T:
+    """Return an answer; ask again for up to `BUSY_S` while the server is busy, and say so once.
+
+    Raises
+    ------
+    RefusedError
+        If the server is still busy then, or refuses for another reason.
+    """
+    clock = SystemClock()
+    begun_ns, wait_s, is_said = clock.monotonic_ns(), FIRST_WAIT_S, False
+    while True:
+        try:
+            return ask()
+        except RefusedError as error:
+            left_s = BUSY_S - (clock.monotonic_ns() - begun_ns) / 1e9
+            if error.status != BUSY or left_s <= 0:
+                raise
+            if not is_said:
+                complain(f"{error.reason or error}; trying again for up to {BUSY_S:.0f} s", kind="note")
+                is_said = True
+            end_ns = clock.now_ns() + round(1e9 * min(wait_s, left_s))
+            while not clock.sleep_until_ns(end_ns):
+                pass
+            wait_s = min(2.0 * wait_s, LONGEST_WAIT_S)

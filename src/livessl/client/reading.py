@@ -12,7 +12,7 @@ M = TypeVar("M", bound=BaseModel)
 
 
 class NewerServerError(RunError):
-    """A message or answer that this client cannot read, because the server is newer."""
+    """A message or answer that this client cannot read, because the server is newer, or too old."""
 
 
 class ForeignAnswerError(RunError):
@@ -43,4 +43,4 @@ def unreadable(error: ValidationError, path: str) -> RunError:
         return ForeignAnswerError(f"{what}; check that the address is that of a livessl server")
     where = ".".join(str(part) for part in fault["loc"])
     what = f"{path}: cannot read the answer: {where}: {fault['msg']}"
-    return NewerServerError(f"{what}; update livessl if the server is newer, and check that the address is its own")
+    return NewerServerError(f"{what}; update the older of the two, livessl here or the server, and check its address")

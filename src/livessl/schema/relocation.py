@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -29,6 +29,22 @@ class RelocateRequest(BaseModel):
         "first, or `now`, those in force.",
         examples=["now"],
     )
+
+
+Digest = Annotated[
+    str | None,
+    Field(
+        description="Digest of the release, the wanted method, `set_up`, and all settings of the site that decide the "
+        "answer. Answers with equal digests were made with equal settings. Null from a server of an older release.",
+        examples=["3b9f0c6d1e2a4857"],
+    ),
+]
+
+
+class RelocationSettings(Versioned):
+    """What events are located again with."""
+
+    digest: Digest = None
 
 
 class LocationAnswer(Model):
@@ -66,3 +82,4 @@ class Relocated(Versioned):
         ge=0, description="Distance between the two positions in metres; null without one of them.", examples=[0.08]
     )
     took_s: float = Field(ge=0, description="Time that the computation took, in seconds.", examples=[0.4])
+    digest: Digest = None

@@ -18,6 +18,8 @@ from clip_desk import ServedClips, served_clips
 from livessl.cli.main import main
 from livessl.core.types import Frame
 from livessl.server.clips import relocate as relocation
+from livessl.server.clips.relocate import SetUp
+from livessl.server.clips.relocate_many import Task
 from livessl.server.clips.stored_sound import stored_frames
 from livessl.server.overload import Overload
 from messages import event_message
@@ -56,6 +58,16 @@ def test_event_stays_as_it_is(desk: ServedClips) -> None:
     assert found["distance_m"] < 0.01
     assert desk.relocate(before[0]["id"], set_up="now")["set_up"] == "now"
     assert desk.events() == before
+
+
+@pytest.mark.parametrize(("method", "set_up"), [(None, "then"), ("srp-phat", "now")])
+def test_answer_states_the_digest_of_the_command_for_folders(
+    desk: ServedClips, method: str | None, set_up: SetUp
+) -> None:
+    expected = Task(desk.server.parts.site, desk.folder, method, set_up).digest
+    wanted = {"set_up": set_up} if method is None else {"method": method, "set_up": set_up}
+    assert desk.get("relocation-settings", role="viewer", **wanted)["digest"] == expected
+    assert desk.relocate(desk.events()[0]["id"], **wanted)["digest"] == expected
 
 
 def test_what_cannot_be_is_refused(desk: ServedClips) -> None:

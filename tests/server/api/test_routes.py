@@ -63,6 +63,7 @@ ROUTES = {
     "/api/v1/clips",
     "/api/v1/events/{event_id}/clips",
     "/api/v1/events/{event_id}/relocate",
+    "/api/v1/relocation-settings",
     "/api/v1/events/{event_id}/clips/best",
     "/api/v1/events/{event_id}/clips/keep",
     "/api/v1/events/{event_id}/clips/{name}",

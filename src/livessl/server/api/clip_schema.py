@@ -17,10 +17,13 @@ class EventClips(BaseModel):
     event_id: str = Field(description="Id of the event.", examples=["lab-35340000000"])
     state: Literal["none", "waiting", "stored", "unreadable"] = Field(
         description="`waiting`: the recordings are being made. `none`: there are none and there will be none. "
-        "`unreadable`: there are some, and what the server has stored about them is damaged or of another release."
+        "`unreadable`: there are some, and what the server has stored about them is damaged, of another release, or "
+        "cannot be read from the disk."
     )
     problem: str | None = Field(
-        description="Why the recordings are `unreadable`, and what to do; null otherwise.", examples=[None]
+        default=None,
+        description="Why the recordings are `unreadable`, and what to do; null otherwise, and from older servers.",
+        examples=[None],
     )
     keep: bool = Field(description="Whether the recordings are kept for ever.")
     position_m: PositionM | None = Field(description="Place at which the enhanced signal is beamed; null if none.")

@@ -13,7 +13,7 @@ from livessl.schema.answers import errors
 from livessl.server.api.encode import API_VERSION, JsonObject, answer, std_m
 from livessl.server.api.queries import unprocessable
 from livessl.server.api.routes import as_json
-from livessl.server.clips.relocate import BusyError, distance_m, known_methods
+from livessl.server.clips.relocate import BusyError, SetUp, digest_of, distance_m, known_methods
 from livessl.server.clips.stored_sound import NoClipError, RelocationError
 from livessl.server.parts import Parts
 
@@ -28,6 +28,12 @@ _log = logging.getLogger(__name__)
 def relocate_route(parts: Parts) -> APIRouter:
     """Both answers beside each other."""
     clips, relocator, router = parts.clips, parts.relocator, APIRouter(prefix="/api/v1", tags=["clips"])
+
+    @router.get("/relocation-settings", response_model=relocation.RelocationSettings)
+    def get_settings(method: str | None = None, set_up: SetUp = "then") -> Response:
+        """Return the digest that answers of `POST events/{id}/relocate` of this method and set-up would have now."""
+        site = parts.site if relocator is None else relocator.site
+        return as_json({"v": API_VERSION, "digest": digest_of(site, method, set_up)})
 
     @router.post(
         "/events/{event_id}/relocate",
@@ -51,7 +57,7 @@ def relocate_route(parts: Parts) -> APIRouter:
         if clips.is_waiting(event_id):
             raise HTTPException(409, f"the recordings of {event_id!r} are being made; try again in some seconds")
         try:
-            found, took_s = relocator.relocate(event_id, method, wanted.set_up)
+            found, site, took_s = relocator.relocate(event_id, method, wanted.set_up)
         except NoClipError as error:
             raise HTTPException(404, str(error)) from error
         except BusyError as error:
@@ -72,6 +78,7 @@ def relocate_route(parts: Parts) -> APIRouter:
                 "other_sources": [answer(other) for other in found.others],
                 "distance_m": distance_m(stored["position_m"], found.event),
                 "took_s": round(took_s, 3),
+                "digest": digest_of(site, wanted.method, wanted.set_up),
             }
         )
 

@@ -104,7 +104,6 @@ class ClipFolder(ClipReader):
                 )
 
     def _load(self, folder: Path) -> None:
-        """Finish what is being deleted, or enter a clip; one that the disk refuses is tried again by `expire`."""
         if folder.name.startswith(PARTIAL):
             self._finish(folder)
         elif folder.is_dir():
@@ -117,11 +116,10 @@ class ClipFolder(ClipReader):
     def _entry(self, folder: Path) -> _Entry:
         keep: bool | None = None
         try:
-            clip = self.read(folder.name)
+            if clip := self.read(folder.name):
+                return _entry_of(clip)
         except UnreadableClipError as error:
-            clip, keep = None, error.keep
-        if clip is not None:
-            return _entry_of(clip)
+            keep = error.keep
         sizes = [path.stat().st_size for path in folder.iterdir()]
         return _Entry((folder / ABOUT).stat().st_mtime_ns, sum(sizes), keep)
 

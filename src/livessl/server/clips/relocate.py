@@ -6,15 +6,18 @@ answer is the same.
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Final, Literal
 
 import numpy as np
 
+from livessl import __version__
 from livessl.clock import Clock
 from livessl.core.methods import METHODS
 from livessl.core.types import (
@@ -80,6 +83,32 @@ class Relocation:
 
 def _go_on() -> None:
     """Never end a computation."""
+
+
+def digest_of(site: Site, method: str | None, set_up: SetUp) -> str:
+    """Return a digest of everything but the clips that decides the answers.
+
+    These are the release, the method and the set-up, and of the site the processed arrays (poses, bands, accuracy,
+    joints), the speed of sound, the search grid, the activity detection and the fusion. The code of a method that is
+    named by MODULE:NAME is not part of it.
+
+    Parameters
+    ----------
+    site : Site
+        With the poses of now.
+    method : str or None
+        None takes the one by which each event was located.
+    set_up : "then" or "now"
+    """
+    decisive = {
+        "version": __version__,
+        "method": method,
+        "set_up": set_up,
+        "arrays": [{**asdict(spec), "microphones_m": spec.microphones_m.round(9).tolist()} for spec in site.processed],
+        "c_m_s": site.c_m_s,
+        "settings": site.model_dump(mode="json", include={"site", "room", "grid", "activity", "fusion"}),
+    }
+    return hashlib.sha256(json.dumps(decisive, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def known_methods(site: Site) -> tuple[str, ...]:
@@ -285,8 +314,16 @@ class Relocator:
         if ended is not None:
             ended.set()
 
-    def relocate(self, event_id: str, method: str, set_up: SetUp) -> tuple[Relocation, float]:
-        """Locate an event again, and wait for it, as the function does; return also how long it took, in seconds.
+    @property
+    def site(self) -> Site:
+        """The site with the poses that are in force."""
+        return self._site()
+
+    def relocate(self, event_id: str, method: str, set_up: SetUp) -> tuple[Relocation, Site, float]:
+        """Locate an event again, and wait for it, as the function does.
+
+        Return also the site by which it was located, whose poses may change meanwhile, and how long it took, in
+        seconds.
 
         Raises
         ------
@@ -299,11 +336,11 @@ class Relocator:
         if not self._one_at_a_time.acquire(blocking=False):  # a thread that waited would be missing for other requests
             raise BusyError("another event is being located again; try again in some seconds")
         try:
-            begun_ns = self._clock.monotonic_ns()
+            begun_ns, site = self._clock.monotonic_ns(), self.site
             made = self._at_leisure(
-                lambda: relocate(self._site(), self._folder, event_id, method, set_up, self._give_way, MOST_BYTES)
+                lambda: relocate(site, self._folder, event_id, method, set_up, self._give_way, MOST_BYTES)
             )
-            return made, (self._clock.monotonic_ns() - begun_ns) / 1e9
+            return made, site, (self._clock.monotonic_ns() - begun_ns) / 1e9
         finally:
             self._one_at_a_time.release()
 

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
 from threadpoolctl import threadpool_limits
 
-from livessl import __version__
-from livessl.core.types import ArraySpec
 from livessl.errors import ConfigError
 from livessl.server.api.encode import JsonObject, answer
 from livessl.server.clips.reader import ClipReader
-from livessl.server.clips.relocate import SetUp, distance_m, relocate_sound
+from livessl.server.clips.relocate import SetUp, digest_of, distance_m, relocate_sound
 from livessl.server.clips.stored_sound import RelocationError, stored_clip, stored_sound
 from livessl.site.models import Site
 from livessl.workers import on_cores
@@ -44,26 +40,8 @@ class Task:
 
     @cached_property
     def digest(self) -> str:
-        """Digest of everything but the clips that decides the answers.
-
-        These are the release, the method and the set-up, and of the site the processed arrays (poses, bands, accuracy,
-        joints), the speed of sound, the search grid, the activity detection and the fusion. The code of a method that
-        is named by MODULE:NAME is not part of it.
-        """
-        site = self.site
-        decisive = {
-            "version": __version__,
-            "method": self.method,
-            "set_up": self.set_up,
-            "arrays": [_decisive(spec) for spec in site.processed],
-            "c_m_s": site.c_m_s,
-            "settings": site.model_dump(mode="json", include={"site", "room", "grid", "activity", "fusion"}),
-        }
-        return hashlib.sha256(json.dumps(decisive, sort_keys=True).encode()).hexdigest()[:16]
-
-
-def _decisive(spec: ArraySpec) -> JsonObject:
-    return {**asdict(spec), "microphones_m": spec.microphones_m.round(9).tolist()}
+        """Digest of everything but the clips that decides the answers: see `digest_of`."""
+        return digest_of(self.site, self.method, self.set_up)
 
 
 def relocate_one(task: Task, event_id: str) -> JsonObject:
