@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import logging
-from typing import Final
+from typing import Annotated, Final
 
-from fastapi import APIRouter, HTTPException, Request, Response
+from fastapi import APIRouter, HTTPException, Query, Request, Response
 
 from livessl.errors import ConfigError
 from livessl.schema import relocation
@@ -16,6 +16,11 @@ from livessl.server.api.routes import as_json
 from livessl.server.clips.relocate import BusyError, SetUp, digest_of, distance_m, known_methods
 from livessl.server.clips.stored_sound import NoClipError, RelocationError
 from livessl.server.parts import Parts
+
+Method = Annotated[
+    str | None, Query(min_length=1, max_length=200, description="As in the request; absent for that of each event.")
+]
+SetUpWanted = Annotated[SetUp, Query(description="As in the request.")]
 
 _TEXTS: Final = {
     404: "There is no event of that id, or it has no recordings.",
@@ -30,8 +35,8 @@ def relocate_route(parts: Parts) -> APIRouter:
     clips, relocator, router = parts.clips, parts.relocator, APIRouter(prefix="/api/v1", tags=["clips"])
 
     @router.get("/relocation-settings", response_model=relocation.RelocationSettings)
-    def get_settings(method: str | None = None, set_up: SetUp = "then") -> Response:
-        """Return the digest that answers of `POST events/{id}/relocate` of this method and set-up would have now."""
+    def get_relocation_settings(method: Method = None, set_up: SetUpWanted = "then") -> Response:
+        """Digest that answers of `POST events/{id}/relocate` with this method and set-up would have now."""
         site = parts.site if relocator is None else relocator.site
         return as_json({"v": API_VERSION, "digest": digest_of(site, method, set_up)})
 
