@@ -47,6 +47,7 @@ def test_answers_stand_beside_each_other(desk: ServedClips) -> None:
         assert np.linalg.norm(np.subtract(again["position_m"], source.position_m)) < 0.2
         apart_m = np.linalg.norm(np.subtract(again["position_m"], event["position_m"]))
         assert found["distance_m"] == pytest.approx(apart_m, abs=2e-3)
+        assert found["digest"] == stated(desk, "srp-phat", "then")
         for answer in (stored, again):
             assert answer["std_m"] == pytest.approx(np.linalg.norm(answer["covariance_m2"], 2) ** 0.5, abs=1e-3)
 
@@ -56,18 +57,18 @@ def test_event_stays_as_it_is(desk: ServedClips) -> None:
     found = desk.relocate(before[0]["id"])  # by its own method, with the poses of then
     assert (found["again"]["method"], found["set_up"], found["moved_arrays"]) == ("onset", "then", [])
     assert found["distance_m"] < 0.01
-    assert desk.relocate(before[0]["id"], set_up="now")["set_up"] == "now"
+    assert found["digest"] == stated(desk, None, "then")
+    again = desk.relocate(before[0]["id"], set_up="now")
+    assert (again["set_up"], again["digest"]) == ("now", stated(desk, None, "now"))
     assert desk.events() == before
 
 
-@pytest.mark.parametrize(("method", "set_up"), [(None, "then"), ("srp-phat", "now")])
-def test_answer_states_the_digest_of_the_command_for_folders(
-    desk: ServedClips, method: str | None, set_up: SetUp
-) -> None:
-    expected = Task(desk.server.parts.site, desk.folder, method, set_up).digest
+def stated(desk: ServedClips, method: str | None, set_up: SetUp) -> str:
+    """The digest that the server states, which is that of the command for folders."""
     wanted = {"set_up": set_up} if method is None else {"method": method, "set_up": set_up}
-    assert desk.get("relocation-settings", role="viewer", **wanted)["digest"] == expected
-    assert desk.relocate(desk.events()[0]["id"], **wanted)["digest"] == expected
+    digest: str = desk.get("relocation-settings", role="viewer", **wanted)["digest"]
+    assert digest == Task(desk.server.parts.site, desk.folder, method, set_up).digest
+    return digest
 
 
 def test_what_cannot_be_is_refused(desk: ServedClips) -> None:
