@@ -58,6 +58,17 @@ def test_sessions_of_two_wirings_are_refused(tmp_path: Path, directory: Path) ->
         assign_sessions(site_of({NORTH: [2, 1, 3, 4]}), [read_session(directory), read_session(other)])
 
 
+@pytest.mark.parametrize("text", [None, "nodes: {}\n"], ids=["other inputs", "no inputs"])
+def test_the_order_of_one_session_is_not_that_of_another(tmp_path: Path, directory: Path, text: str | None) -> None:
+    other = session_of(tmp_path, [11, 12, 13, 14])
+    if text is not None:
+        (other / SITE_FILE).write_text(text, encoding="utf-8")
+    sessions = [read_session(directory), read_session(other)]
+    for given_in in (sessions, sessions[::-1]):
+        with pytest.raises(DeviceError, match="give sessions of different wirings one by one"):
+            assign_sessions(site_of({NORTH: [1, 2, 3, 4]}), given_in)
+
+
 def of_number(text: str) -> str:
     return f"nodes: {{pc: {{arrays: {{north: [1, {text}]}}}}}}"
 

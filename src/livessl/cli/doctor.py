@@ -51,7 +51,7 @@ def run(arguments: argparse.Namespace) -> int:
             "doctor: with --url the server's own sounds are examined, so that --session, --wav, --channels and --joint "
             "have no effect; remove them, or --url"
         )
-    examination = _ask(arguments.url, arguments.token_file) if arguments.url else _examine(arguments)
+    examination, hidden = _ask(arguments.url, arguments.token_file) if arguments.url else _examine(arguments)
     for finding in examination.findings:
         print(
             json.dumps({"kind": "finding"} | asdict(finding)) if arguments.json else finding_line(finding), flush=True
@@ -64,33 +64,31 @@ def run(arguments: argparse.Namespace) -> int:
         )
     elif not examination.findings and not arguments.json:
         print(f"no fault found in {_count(examination.sounds)}")
-    for spot in examination.blind_spots:
-        complain(blind_spot_line(spot), kind="note")
+    for note in hidden:
+        complain(note, kind="note")
     return OK if examination.is_faultless else FAILED
 
 
-def _examine(arguments: argparse.Namespace) -> Examination:
+def _examine(arguments: argparse.Namespace) -> tuple[Examination, list[str]]:
+    """Return what recordings show, and in words what they cannot show."""
     from livessl.examination import examine_parts
 
     site, parts, span = recordings_given(arguments, "doctor", ", or --url")
     print_warnings(site)
     with progress.timed("examining", *span) as bar:
-        return examine_parts(site, parts, bar)
+        examination = examine_parts(site, parts, bar)
+    return examination, [blind_spot_line(spot) for spot in examination.blind_spots]
 
 
-def _ask(url: str, token_file: Path | None) -> Examination:
-    """Return what a running server has found."""
-    from livessl.core.commission.blind_spot import BlindSpot
+def _ask(url: str, token_file: Path | None) -> tuple[Examination, list[str]]:
+    """Return what a running server has found, and in its own words what its sounds cannot show."""
     from livessl.core.commission.finding import Finding
     from livessl.examination import Examination
     from livessl.schema.findings import Findings
 
     answer = ask_for(Findings, url, "findings", token_file)
     findings = tuple(Finding(**one.model_dump(exclude={"kind"})) for one in answer.findings)
-    blind_spots = tuple(
-        BlindSpot(one.fault, tuple(one.arrays), one.least, tuple(one.along)) for one in answer.blind_spots
-    )
-    return Examination(findings, answer.sounds, blind_spots)
+    return Examination(findings, answer.sounds), [f"{spot.message}; {spot.cure}" for spot in answer.blind_spots]
 
 
 def recordings_given(

@@ -222,18 +222,20 @@ def _reordered(site: Site, sessions: Sequence[Session], files: OpenFiles) -> dic
     wanted = {name: inputs for node in site.nodes.values() for name, inputs in node.arrays.items()}
     found: dict[str, list[int]] = {}
     for session in sessions:
-        pieces = {piece.array for piece in session.pieces}
-        for array, inputs in session.inputs().items():
-            if array not in pieces or array not in wanted:
+        recorded = session.inputs()
+        for array in dict.fromkeys(piece.array for piece in session.pieces):
+            if array not in wanted:
                 continue
-            if sorted(inputs) != sorted(wanted[array]) or len(set(inputs)) != len(inputs):
+            inputs = recorded.get(array, wanted[array])  # if they are not known, channels are as they were recorded
+            if sorted(inputs) == sorted(wanted[array]) and len(set(inputs)) == len(inputs):
+                order = [inputs.index(number) + 1 for number in wanted[array]]
+            else:
+                order = list(range(1, len(inputs) + 1))
                 files.notes.append(
                     f"{session.directory}: array {array!r} was recorded from the inputs {_listed(inputs)}, and the "
                     f"site file gives {_listed(wanted[array])}; channels are taken as they were recorded: record again "
                     "to use the inputs of the site file"
                 )
-                continue
-            order = [inputs.index(number) + 1 for number in wanted[array]]
             if found.setdefault(array, order) != order:
                 raise DeviceError(
                     f"{session.directory}: expected array {array!r} recorded in the order of the other sessions, got "

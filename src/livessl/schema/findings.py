@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Literal
 
 from pydantic import Field
@@ -40,7 +39,10 @@ class BlindSpot(Model):
     """A shift or turn of an array, or a reflection of the whole room, that the last sounds would not show."""
 
     kind: Literal["blind_spot"]
-    fault: Literal["moved", "turned", "mirrored"] = Field(description="Code of the fault that would stay hidden.")
+    fault: str = Field(
+        description="Code of the fault that would stay hidden: `moved`, `turned` or `mirrored`; others may be added.",
+        examples=["moved"],
+    )
     arrays: list[str] = Field(
         min_length=1,
         description="The array; several if the same fault of each of them would be hidden alike.",
@@ -73,11 +75,6 @@ class BlindSpot(Model):
     cure: str = Field(
         description="What would show it.", examples=["clap at places that you know, and run livessl calibrate verify"]
     )
-
-    @property
-    def least(self) -> float:
-        """`least_m` of a shift, and `least_deg` of a turn; NaN in an answer that has neither."""
-        return next((least for least in (self.least_m, self.least_deg) if least is not None), math.nan)
 
 
 class Findings(Versioned):

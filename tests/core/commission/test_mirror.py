@@ -77,12 +77,35 @@ def test_a_third_array_in_the_plane_does_not() -> None:
     assert spot.arrays == ("west", "east", "middle")
 
 
-def test_flat_arrays_whose_plane_is_the_mirror_have_no_exchanged_channels() -> None:
+def ring(count: int) -> FloatArray:
+    """Microphones of a level circle, of which none is in the plane of y = 0 (count is even)."""
+    angles = 2.0 * np.pi * (np.arange(count) + 0.5) / count
+    return np.stack([0.1 * np.cos(angles), 0.1 * np.sin(angles), np.zeros(count)], axis=1)
+
+
+GRID = np.stack(np.meshgrid([-0.063, -0.021, 0.021, 0.063], [-0.063, -0.021, 0.021, 0.063], [0.0]), axis=-1).reshape(
+    -1, 3
+)
+
+
+@pytest.mark.parametrize("array", [ring(4), ring(6), ring(8), ring(16), GRID], ids=["4", "6", "8", "16", "grid"])
+def test_flat_arrays_of_any_size_are_their_own_images(array: FloatArray) -> None:
+    filed = {"west": array + np.array([2.0, 5.0, 1.5]), "east": array + np.array([6.0, 5.0, 1.5])}
+    spot = mirrored(filed, near(np.random.default_rng(4)), BOUNDS_M)
+    assert spot is not None
+    assert spot.arrays == ("west", "east")
+    assert spot.least == pytest.approx(0.0, abs=1e-6)
+    assert np.abs(spot.along) == pytest.approx([0.0, 1.0, 0.0], abs=1e-6)
+
+
+@pytest.mark.parametrize("array", [ring(4), ring(8), GRID], ids=["4", "8", "grid"])
+def test_the_plane_of_flat_arrays_needs_no_exchanged_channels(array: FloatArray) -> None:
     """Their mirror images are known from the geometry, and told before any sound."""
-    square = np.array([[0.1, 0.1, 0.0], [-0.1, 0.1, 0.0], [-0.1, -0.1, 0.0], [0.1, -0.1, 0.0]])
-    filed = {"west": square + WEST_M, "east": square + np.array([6.0, 6.0, 1.4])}
-    spot = mirrored(filed, np.array([[4.0, 5.0, 1.2]]), BOUNDS_M)
-    assert spot is None or abs(spot.along[2]) < 0.9
+    filed = {"west": array + np.array([2.0, 5.0, 1.5]), "east": array + np.array([6.0, 5.0, 1.5])}
+    on_one_side_m = np.array([[4.0, 0.5, 1.2]])  # whose image in any upright plane is outside
+    narrow_m = np.array([[0.0, 8.0], [0.0, 5.5], [0.0, 4.0]])
+    spot = mirrored(filed, on_one_side_m, narrow_m)
+    assert spot is None
 
 
 def test_lines_have_none() -> None:

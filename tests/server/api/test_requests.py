@@ -97,6 +97,14 @@ def test_value_that_json_cannot_hold_is_refused_like_any_other(client: httpx.Cli
         assert all(set(fault) >= {"loc", "msg", "type"} for fault in answer.json()["detail"])
 
 
+@pytest.mark.parametrize("content_type", [None, "application/octet-stream", "text/plain"])
+def test_bytes_that_are_no_text_are_refused_like_any_other(client: httpx.Client, content_type: str | None) -> None:
+    headers = {} if content_type is None else {"Content-Type": content_type}
+    answer = client.put(f"{API}/arrays/north/enabled", content=b"\xff{\xfe", headers=headers)
+    assert answer.status_code == 422
+    assert answer.json()["detail"]
+
+
 def test_every_unknown_parameter_is_named(client: httpx.Client) -> None:
     faults = client.get(f"{API}/events?zones=a&limit=3&size=4").json()["detail"]
     assert [fault["loc"][1] for fault in faults] == ["zones", "size"]

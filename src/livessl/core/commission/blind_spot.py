@@ -24,7 +24,8 @@ class BlindSpot:
     fault : str
         `moved`, `turned` or `mirrored`.
     arrays : tuple of str
-        The array; several if the same fault of each of them would be hidden alike.
+        The array; several if the same fault of each of them would be hidden alike, and of a mirrored room those whose
+        channels would be exchanged.
     least : float
         Smallest shift, in metres, or turn, in degrees, that the sounds would show in nine of ten cases. Of a mirrored
         room the turn, in degrees, that some array would have besides exchanged channels.
@@ -45,8 +46,8 @@ class BlindSpot:
         if self.fault == "mirrored":
             return (
                 "these sounds cannot show whether all places are mirrored in the plane through the arrays, at right "
-                f"angles to ({along}), because channels are exchanged at {' and '.join(repr(a) for a in self.arrays)}, "
-                f"and arrays are turned by up to {self.least:.0f} degrees"
+                f"angles to ({along}), because channels are exchanged at {' and '.join(map(repr, self.arrays))}, and "
+                f"arrays are turned by up to {self.least:.0f} degrees"
             )
         if self.fault == "turned":
             size = f" by less than {self.least:.0f} degrees" if self.least < MOST_TURN_DEG else ""

@@ -7,27 +7,30 @@ cannot be told from one whose channels are exchanged at each array: every place 
 
 from __future__ import annotations
 
-from itertools import combinations, permutations
+from collections.abc import Iterator
+from itertools import islice
 from typing import Final
 
 import numpy as np
+from scipy.spatial.distance import pdist, squareform
 
 from livessl.core.commission.blind_spot import BlindSpot
 from livessl.core.commission.places import Microphones
-from livessl.core.types import FloatArray, IntArray
+from livessl.core.types import BoolArray, FloatArray
 
 MOST_TURN_DEG: Final = 25.0
 """Largest turn of an array, in degrees, by which a reflection may differ from the filed set-up: people file poses that
 are further off less often than they exchange channels."""
 
 SAME_M: Final = 0.02
-"""Distance, in metres, within which microphones are at the same place, and centres in one plane."""
+"""Distance, in metres, within which centres are in one plane, and microphones at the same place. In small arrays a third
+of the least distance between microphones counts instead, so that neighbours are not taken for each other."""
 
 BEYOND_M: Final = 0.3
 """Distance, in metres, by which a place may be outside the search volume: places of single sounds have errors."""
 
-ALL_ORDERS: Final = 5
-"""Most microphones of an array of which all orders are tried; of larger ones only exchanges of two."""
+MOST_ORDERS: Final = 100
+"""Most orders of an array's channels that are tried: a cube of eight microphones has 48 that keep all distances."""
 
 PLANES: Final = 180
 """Number of planes that are tried through arrays on one line."""
@@ -48,32 +51,41 @@ def mirrored(microphones: Microphones, places_m: FloatArray, bounds_m: FloatArra
     Returns
     -------
     BlindSpot or None
-        Of the reflection that needs the smallest turns; `least` is the largest of these, and `along` the normal of the
-        plane. An array on one line has no order that a reflection changes, so with one there is None.
+        Of the reflection that needs the smallest turns: the arrays whose channels it exchanges, the largest of the
+        turns as `least`, and the normal of the plane as `along`. None with an array on one line, which no reflection
+        tells from a turn, and where no array needs exchanged channels: then the geometry shows it before any sound.
     """
-    spans = [np.linalg.svd(at_m - at_m.mean(axis=0), compute_uv=False) for at_m in microphones.values()]
-    if any(len(span) < 2 or span[1] < SAME_M for span in spans):
+    if any(_is_line(at_m) for at_m in microphones.values()):
         return None
     centres_m = np.array([at_m.mean(axis=0) for at_m in microphones.values()])
-    middle_m, normals = centres_m.mean(axis=0), _normals(centres_m)
+    normals = _normals(centres_m)
+    normals = normals[_are_inside(places_m, centres_m.mean(axis=0), normals, bounds_m)]
     if len(normals) == 0:
         return None
-    turns_deg = np.zeros(len(normals))
-    changed = np.zeros(len(normals), dtype=bool)
-    for at_m in microphones.values():
-        turn_deg, order = _turns(at_m, normals)
+    turns_deg, changed = np.zeros(len(normals)), {}
+    for name, at_m in microphones.items():
+        turn_deg, changed[name] = _turns(at_m, normals)
         turns_deg = np.maximum(turns_deg, turn_deg)
-        changed |= order > 0
-    heights_m = (places_m - middle_m) @ normals.T
-    mirrored_m = places_m[:, None] - 2.0 * heights_m[..., None] * normals
-    beyond_m = np.maximum(bounds_m[:, 0] - mirrored_m, mirrored_m - bounds_m[:, 1])
-    possible = changed & (beyond_m <= BEYOND_M).all(axis=(0, 2))
-    turns_deg[~possible] = np.inf
+    turns_deg[~np.any(list(changed.values()), axis=0)] = np.inf
     best = int(turns_deg.argmin())
     if turns_deg[best] > MOST_TURN_DEG:
         return None
     normal = normals[best] * np.sign(normals[best][np.abs(normals[best]).argmax()])
-    return BlindSpot("mirrored", tuple(microphones), float(turns_deg[best]), tuple(normal.tolist()))
+    exchanged = tuple(name for name, one in changed.items() if one[best])
+    return BlindSpot("mirrored", exchanged, float(turns_deg[best]), tuple(normal.tolist()))
+
+
+def _is_line(at_m: FloatArray) -> bool:
+    spans = np.linalg.svd(at_m - at_m.mean(axis=0), compute_uv=False)
+    return len(spans) < 2 or bool(spans[1] < SAME_M)
+
+
+def _are_inside(places_m: FloatArray, middle_m: FloatArray, normals: FloatArray, bounds_m: FloatArray) -> BoolArray:
+    """Whether all places (S, 3) are inside the search volume when they are mirrored in each plane."""
+    heights_m = (places_m - middle_m) @ normals.T
+    mirrored_m = places_m[:, None] - 2.0 * heights_m[..., None] * normals
+    beyond_m = np.maximum(bounds_m[:, 0] - mirrored_m, mirrored_m - bounds_m[:, 1])
+    return np.asarray((beyond_m <= BEYOND_M).all(axis=(0, 2)))
 
 
 def _normals(centres_m: FloatArray) -> FloatArray:
@@ -87,13 +99,16 @@ def _normals(centres_m: FloatArray) -> FloatArray:
     return np.asarray(np.cos(angles)[:, None] * flat[0] + np.sin(angles)[:, None] * flat[1])
 
 
-def _turns(at_m: FloatArray, normals: FloatArray) -> tuple[FloatArray, IntArray]:
-    """Return the least turn, in degrees, that brings an array to its reflections, and with which order of its channels.
+def _turns(at_m: FloatArray, normals: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Return the least turn, in degrees, that brings an array to each reflection, and whether channels change places.
 
-    Infinity where no order does; order 0 is the filed one, which is preferred.
+    Infinite where no order of the channels does. The filed order is preferred if its turn is not too large.
     """
     own_m = at_m - at_m.mean(axis=0)
-    orders = _orders(len(own_m))
+    apart_m = squareform(pdist(own_m))
+    same_m = min(SAME_M, float(pdist(own_m).min()) / 3.0)
+    are_alike = np.abs(apart_m[:, :, None, None] - apart_m) <= 2.0 * same_m
+    orders = np.array(list(islice(_orders(are_alike, ()), MOST_ORDERS)))
     ordered_m = own_m[orders]  # (P, K, 3)
     reflected_m = own_m - 2.0 * (own_m @ normals.T).T[..., None] * normals[:, None]  # (N, K, 3)
     left, sizes, right = np.linalg.svd(np.einsum("pki,nkj->npij", ordered_m, reflected_m))
@@ -103,18 +118,22 @@ def _turns(at_m: FloatArray, normals: FloatArray) -> tuple[FloatArray, IntArray]
     left[..., :, 2] *= handedness[..., None]
     traces = np.einsum("npij,npji->np", left, right)
     turns_deg = np.degrees(np.arccos(np.clip((traces - 1.0) / 2.0, -1.0, 1.0)))
-    turns_deg[squares_m2 > len(own_m) * SAME_M**2] = np.inf
-    order = turns_deg.argmin(axis=1)
-    return turns_deg[np.arange(len(normals)), order], order
+    turns_deg[squares_m2 > len(own_m) * same_m**2] = np.inf
+    filed_deg, least_deg = turns_deg[:, 0], turns_deg.min(axis=1)
+    is_filed = filed_deg <= MOST_TURN_DEG
+    return np.where(is_filed, filed_deg, least_deg), ~is_filed
 
 
-def _orders(count: int) -> IntArray:
-    """Return orders of channels (P, K), the filed one first."""
-    if count <= ALL_ORDERS:
-        return np.array(list(permutations(range(count))))
-    orders = [np.arange(count)]
-    for one, other in combinations(range(count), 2):
-        exchanged = np.arange(count)
-        exchanged[[one, other]] = other, one
-        orders.append(exchanged)
-    return np.array(orders)
+def _orders(are_alike: BoolArray, begun: tuple[int, ...]) -> Iterator[tuple[int, ...]]:
+    """Yield the orders of channels that begin so and keep all distances between microphones, the filed one first.
+
+    `are_alike` (K, K, K, K) is whether the distance between two microphones is that between two others.
+    """
+    index = len(begun)
+    if index == len(are_alike):
+        yield begun
+        return
+    able = are_alike[index, range(index), :, begun].all(axis=0)
+    for other in np.flatnonzero(able).tolist():
+        if other not in begun:
+            yield from _orders(are_alike, (*begun, other))

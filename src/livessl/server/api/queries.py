@@ -137,12 +137,12 @@ def unprocessable(name: str, what: str, part: str = "query") -> HTTPException:
 
 
 async def refuse_request(_request: Request, error: Exception) -> Response:
-    """Answer 422 with the faults of a request, without the values if JSON cannot hold them, such as deep nesting."""
+    """Answer 422 with the faults of a request, without the values if JSON cannot hold them: deep nesting, odd bytes."""
     assert isinstance(error, RequestValidationError)
     faults = error.errors()
     try:
         body = orjson.dumps({"detail": jsonable_encoder(faults)})
-    except (TypeError, RecursionError):
+    except (TypeError, ValueError, RecursionError):
         told = [{name: fault[name] for name in ("type", "loc", "msg")} for fault in faults]
         body = orjson.dumps({"detail": jsonable_encoder(told)})
     return Response(body, 422, media_type="application/json")
