@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -79,6 +81,27 @@ def test_file_that_cannot_be_written_is_named_with_the_cure(run: Run, tmp_path: 
     done = run("check", write_site(tmp_path), "--png", drawing)
     assert done.code == 1
     assert f"error: {drawing}: No such file or directory; correct the path or its permissions\n" in done.err
+
+
+@pytest.mark.parametrize("name", [None, "out.json"])
+@pytest.mark.parametrize(
+    ("number", "cure"),
+    [(errno.ENOSPC, "; free some space"), (errno.EDQUOT, "; free some space"), (errno.EMFILE, ""), (errno.EIO, ""),
+     *((number, "; correct the path or its permissions")
+       for number in (errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.EISDIR, errno.EROFS))],
+)  # fmt: skip
+def test_errors_of_files_have_the_cure_that_helps(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, cure: str, name: str | None
+) -> None:
+    def fails(*_: object, **__: object) -> None:
+        raise OSError(number, os.strerror(number), name)
+
+    monkeypatch.setattr("livessl.site.load.load_site", fails)
+    done = run("plan", "--site", tmp_path / "site.yaml")
+    (line,) = done.err.splitlines()
+    assert done.code == 1
+    assert line.startswith(f"livessl: error: {name}: " if name else "livessl: error: ")
+    assert line.endswith(os.strerror(number) + (cure if name or "space" in cure else ""))
 
 
 @pytest.mark.parametrize("content", ["", "one\ntwo", "schlüssel", "a\x07b"])

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from cli.command_runs import COMMANDS, Run
 from livessl.cli.main import main
 from livessl.errors import did_you_mean
+from publishing_lives import free_port
 from small_site import write_site
 
 
@@ -75,6 +76,8 @@ def test_options_without_effect_are_refused(run: Run, tmp_path: Path) -> None:
     for command in (("doctor", "--session", tmp_path), ("calibrate", "refine", "--session", tmp_path)):
         done = run(*command, "--site", site, "--channels", "north=2,1,3,4")
         assert (done.code, "--channels names channels of the files of --wav" in done.err) == (2, True)
-    for ignored in (("--session", tmp_path), ("--site", site), ("--joint", "both=north,south")):
-        done = run("doctor", "--url", "http://127.0.0.1:9", *ignored)
+    for ignored in (("--session", tmp_path), ("--wav", "north=n.wav"), ("--joint", "both=north,south")):
+        done = run("doctor", "--site", site, "--url", "http://127.0.0.1:9", *ignored)
         assert (done.code, "have no effect" in done.err) == (2, True)
+    done = run("doctor", "--site", site, "--url", f"http://127.0.0.1:{free_port()}")
+    assert (done.code, "no answer from a server" in done.err) == (1, True)

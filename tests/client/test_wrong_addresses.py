@@ -33,19 +33,21 @@ class Answers(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         self.server.seen.append(dict(self.headers))
         self.send_response(self.server.status)
-        for name, value in self.server.headers.items():
+        for name, value in ({"Content-Length": str(len(self.server.body))} | self.server.headers).items():
             self.send_header(name, value)
-        self.send_header("Content-Length", "0")
         self.end_headers()
+        self.wfile.write(self.server.body)
+        self.close_connection = True
 
     def log_message(self, *_: Any) -> None:
         pass
 
 
 @contextmanager
-def answering(status: int, **headers: str) -> Iterator[Any]:
+def answering(status: int, body: bytes = b"", **headers: str) -> Iterator[Any]:
     server: Any = ThreadingHTTPServer(("127.0.0.1", 0), Answers)
-    server.status, server.headers, server.seen = status, headers, []
+    server.status, server.body, server.seen = status, body, []
+    server.headers = {name.replace("_", "-"): value for name, value in headers.items()}
     thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
     thread.start()
     try:
@@ -185,3 +187,26 @@ def test_what_speaks_no_http_may_be_the_port_of_the_nodes(
 def test_another_program_at_the_address_is_no_livessl_server(status: int) -> None:
     with answering(status) as other, pytest.raises(RunError, match="is no livessl server, so check the address"):
         ask(f"http://127.0.0.1:{other.server_address[1]}", "findings", None)
+
+
+@pytest.mark.parametrize(
+    ("body", "headers", "said"),
+    [
+        (b'{"detail": "no such event"}', {}, ": no such event"),
+        (b'{"detail": [{"msg": "too small"}, {"msg": "too large"}]}', {}, ": too small; too large"),
+        (b'{"detail": "' + 900 * b"x" + b'"}', {}, ": " + 900 * "x"),
+        *((body, {}, "") for body in (
+            b"<html>", b"\xff\xfe", b"[]", b'"detail"', 200_000 * b"[", 9000 * b"9",
+            b'{"detail": 3}', b'{"detail": ["x"]}', b'{"detail": {"msg": "x"}}', b'{"detail": [{"text": "x"}]}',
+        )),
+        (b"cut", {"Content_Length": "1000"}, ""),
+        (b"5\r\ncut", {"Transfer_Encoding": "chunked"}, ""),
+    ],
+)  # fmt: skip
+def test_whatever_a_foreign_server_answers_is_one_error(body: bytes, headers: dict[str, str], said: str) -> None:
+    with answering(404, body, **headers) as other:
+        with pytest.raises(RunError, match=f"the server answered 404 Not Found{said or '; what answers there is no'}"):
+            ask(url_of(other), "site", None)
+        with pytest.raises(RefusedError, match=f"the server answered 404{said}") as refused:
+            Address.of(url_of(other), None, None).get("site")
+    assert len(str(refused.value)) < 1200

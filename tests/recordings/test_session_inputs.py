@@ -69,7 +69,15 @@ def test_the_order_of_one_session_is_not_that_of_another(tmp_path: Path, directo
             assign_sessions(site_of({NORTH: [1, 2, 3, 4]}), given_in)
 
 
-@pytest.mark.parametrize("text", ["", "[", "nodes: 3", "nodes: {pc: {arrays: [1]}}", "nodes: {pc: {arrays: {a: x}}}"])
+def of_number(text: str) -> str:
+    return f"nodes: {{pc: {{arrays: {{north: [1, {text}]}}}}}}"
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "[", "[" * 2000, "nodes: 3", "nodes: {pc: {arrays: [1]}}", "nodes: {pc: {arrays: {a: x}}}", "2026-99-99",
+     *map(of_number, [".inf", "-.inf", ".nan", "x", "null", "[2]", "2026-11-30", "2026-99-99", "9" * 5000])],
+)  # fmt: skip
 def test_a_damaged_site_file_names_no_inputs(tmp_path: Path, text: str) -> None:
     session = read_session(session_of(tmp_path, RECORDED))
     (tmp_path / SITE_FILE).write_text(text, encoding="utf-8")

@@ -60,7 +60,7 @@ def refuse_foreign_file(arguments: argparse.Namespace) -> None:
             path = _named(arguments.site)
         except UseError:
             return  # it is no valid site file, as its reader says
-    refuse_foreign("--write", [path], _is_calibration, arguments.site)
+    refuse_foreign("--write", [path], _is_calibration, arguments.site, "which is no calibration")
 
 
 def _is_calibration(path: Path) -> bool:

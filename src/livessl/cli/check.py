@@ -11,7 +11,7 @@ from livessl.cli import argument
 from livessl.cli.exits import OK, WRONG_USE
 from livessl.cli.options import add_json
 from livessl.cli.output import print_warnings
-from livessl.cli.own_work import is_own_picture, refuse_foreign
+from livessl.cli.own_work import NO_PICTURE, is_own_picture, refuse_foreign
 from livessl.errors import ConfigError, Fault
 
 
@@ -36,7 +36,7 @@ def run(arguments: argparse.Namespace) -> int:
     from livessl.site.load import load_site
 
     if arguments.png is not None:
-        refuse_foreign("--png", [arguments.png], is_own_picture, arguments.site)
+        refuse_foreign("--png", [arguments.png], is_own_picture, arguments.site, NO_PICTURE)
     try:
         site = load_site(arguments.site)
         doors = unprotected_addresses(site)

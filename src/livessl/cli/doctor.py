@@ -46,12 +46,10 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
     from livessl.core.commission.finding import LEAST_SOUNDS
 
-    if arguments.url and (
-        arguments.session or arguments.wav or arguments.channels or arguments.joint or arguments.site
-    ):
+    if arguments.url and (arguments.session or arguments.wav or arguments.channels or arguments.joint):
         raise UseError(
-            "doctor: with --url the server's own sounds and site file are examined, so that --site, --session, --wav, "
-            "--channels and --joint have no effect; remove them, or --url"
+            "doctor: with --url the server's own sounds are examined, so that --session, --wav, --channels and --joint "
+            "have no effect; remove them, or --url"
         )
     examination, hidden = _ask(arguments.url, arguments.token_file) if arguments.url else _examine(arguments)
     for finding in examination.findings:

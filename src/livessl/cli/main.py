@@ -19,6 +19,12 @@ from livessl.cli.standard_streams import open_standard_streams
 from livessl.errors import RunError, UseError
 from livessl.log_format import VARIABLE, LogForm, log_form, set_up_logging
 
+_FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT})
+"""Errors for want of space."""
+
+_OF_PATH: Final = frozenset({errno.ENOENT, errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.EISDIR, errno.EROFS})
+"""Errors that another path or other permissions cure."""
+
 
 @dataclass(frozen=True, slots=True)
 class Command:
@@ -145,11 +151,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _of_file(error: OSError) -> str:
-    """Return the file that an error is about, what is wrong with it and what to do."""
-    if error.filename is None or error.strerror is None:
+    """Return the file that an error is about, as far as it is known, what is wrong with it and what to do."""
+    where = "" if error.filename is None else f"{error.filename}: "  # a file that is open has no name in its errors
+    if error.errno in _FULL:
+        return f"{where}{error.strerror}; free some space"
+    if not where or error.strerror is None:
         return str(error)
-    full = error.errno in (errno.ENOSPC, errno.EDQUOT)
-    return f"{error.filename}: {error.strerror}; {'free some space' if full else 'correct the path or its permissions'}"
+    cure = "; correct the path or its permissions" if error.errno in _OF_PATH else ""
+    return f"{where}{error.strerror}{cure}"
 
 
 def _parser(given: Sequence[str]) -> argparse.ArgumentParser:

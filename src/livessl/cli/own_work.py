@@ -1,4 +1,4 @@
-"""What a command may write over: files that it has made itself, and nothing else."""
+"""What a command may write over: empty files and those that it has made itself, and nothing else."""
 
 from __future__ import annotations
 
@@ -13,11 +13,19 @@ from livessl.errors import UseError
 PICTURE_HEAD: Final = 1024
 """Number of bytes at the beginning of a PNG in which its program is named."""
 
+NO_PICTURE: Final = "which does not say that livessl has drawn it"
+"""What `is_own_picture` has found out about another file."""
+
+_EARLIER_DENSITY: Final = b"pHYs" + 2 * (4331).to_bytes(4, "big") + b"\1"
+"""110 dots per inch in a PNG: pictures of livessl 0.1 and 0.2 name matplotlib, whose own default is 100, and this."""
+
 
 def refuse_foreign(
-    option: str, paths: Iterable[Path], is_own: Callable[[Path], bool], site: Path | None = None
+    option: str, paths: Iterable[Path], is_own: Callable[[Path], bool], site: Path | None = None, foreign: str = ""
 ) -> None:
-    """Raise an error if a command would write over a file that it has not made; call it before anything is computed.
+    """Raise an error if a command would write over what may not be its own; call it before anything is computed.
+
+    Files without content pass: nothing of them can be lost.
 
     Parameters
     ----------
@@ -26,9 +34,11 @@ def refuse_foreign(
     paths : iterable of Path
         Files that the command will write.
     is_own : callable
-        Returns whether an existing file was made by the command.
+        Returns whether an existing file can be told to be the command's own.
     site : Path or None
         The site file given, which is never written over, whoever has made it.
+    foreign : str
+        Relative clause about a file that is not its own; it must be true of a half-written one, too.
 
     Raises
     ------
@@ -39,11 +49,12 @@ def refuse_foreign(
         if not os.path.lexists(path):
             continue
         if site is not None and _is_same(path, site):
-            raise UseError(f"{option}: {path} is the file given as --site and would be lost; name another place")
-        if not path.is_file() or not is_own(path):
+            raise UseError(f"{option}: {path} is the site file and would be lost; name another place")
+        if not path.is_file() or not (path.stat().st_size == 0 or is_own(path)):
+            what = f"{foreign} and" if foreign else "which"
             raise UseError(
-                f"{option}: expected a new or an empty place, got {path}, which this command has not made and would "
-                "write over; name another one"
+                f"{option}: expected a new or an empty place, got {path}, {what} would be written over; name another "
+                "one, or remove the file"
             )
 
 
@@ -51,7 +62,8 @@ def is_own_picture(path: Path) -> bool:
     """Return whether a file is a PNG that livessl has drawn."""
     with path.open("rb") as file:
         head = file.read(PICTURE_HEAD)
-    return head.startswith(b"\x89PNG") and b"Software\0livessl" in head
+    earlier = b"Software\0Matplotlib" in head and _EARLIER_DENSITY in head
+    return head.startswith(b"\x89PNG") and (b"Software\0livessl" in head or earlier)
 
 
 def is_own_json(path: Path, keys: frozenset[str]) -> bool:

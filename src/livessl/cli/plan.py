@@ -11,7 +11,7 @@ from livessl.cli import argument, progress
 from livessl.cli.exits import OK, WRONG_USE
 from livessl.cli.options import add_json, add_site, make_folder
 from livessl.cli.output import complain
-from livessl.cli.own_work import is_own_json, is_own_picture, refuse_foreign
+from livessl.cli.own_work import NO_PICTURE, is_own_json, is_own_picture, refuse_foreign
 from livessl.lab.plan.defaults import CALIBRATION_M
 
 
@@ -75,5 +75,6 @@ def run(arguments: argparse.Namespace) -> int:
 def _refuse_foreign(out: Path, site: Path) -> None:
     """Raise an error if the folder holds a plan or a picture of that name from somebody else."""
     keys = frozenset({"site", "rt60_s", "predicted_error", "advice"})
-    refuse_foreign(f"--out {out}", [out / "plan.json"], lambda path: is_own_json(path, keys), site)
-    refuse_foreign(f"--out {out}", [out / "plan.png"], is_own_picture, site)
+    option = f"--out {out}"
+    refuse_foreign(option, [out / "plan.json"], lambda path: is_own_json(path, keys), site, "which is no complete plan")
+    refuse_foreign(option, [out / "plan.png"], is_own_picture, site, NO_PICTURE)

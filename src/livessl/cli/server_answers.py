@@ -9,7 +9,7 @@ from http.client import HTTPException
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
-from livessl.client.address import check_url, open_url, redirection
+from livessl.client.address import check_url, open_url, reason_of, redirection
 from livessl.errors import RunError, UseError
 
 if TYPE_CHECKING:
@@ -158,7 +158,7 @@ def _answer(address: str, token_file: Path | None, body: bytes | None, wait_s: f
             answer: bytes = response.read()
             return answer
     except urllib.error.HTTPError as error:
-        reason = _reason(error)
+        reason = reason_of(error)
         said = redirection(error) or (reason and f": {reason}")
         cure = "; give --token-file" if error.code in (401, 403) and token_file is None else ""
         if error.code in (404, 405, 501) and not said:  # a livessl server gives a reason
@@ -168,12 +168,3 @@ def _answer(address: str, token_file: Path | None, body: bytes | None, wait_s: f
     except (OSError, ValueError, HTTPException) as error:
         why = getattr(error, "reason", error)
         raise RunError(f"{address}: no answer from a server ({why}); check that it runs and its address") from error
-
-
-def _reason(error: urllib.error.HTTPError) -> str:
-    """Return the reason that a server gives for a refusal; empty if it gives none."""
-    try:
-        detail = json.load(error)["detail"]
-        return detail if isinstance(detail, str) else "; ".join(str(fault["msg"]) for fault in detail)
-    except (OSError, ValueError, KeyError, TypeError):
-        return ""

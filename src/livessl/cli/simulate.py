@@ -61,8 +61,9 @@ def run(arguments: argparse.Namespace) -> int:
     site = load_site(arguments.site)
     if (arguments.out / SESSION_FILE).exists() and not (arguments.out / TRUTH_FILE).exists():
         raise ConfigError([Fault(f"--out {arguments.out}", "holds a recorded session; choose another folder")])
-    own = simulated_files(arguments.out)
-    refuse_foreign(f"--out {arguments.out}", scene_files(arguments.out, site), own.__contains__, arguments.site)
+    option, own = f"--out {arguments.out}", simulated_files(arguments.out)
+    foreign = "which is of no complete simulated session"
+    refuse_foreign(option, scene_files(arguments.out, site), own.__contains__, arguments.site, foreign)
     rates = {} if arguments.sample_rate else device_rates_hz(site)
     rate = float(arguments.sample_rate or max(rates.values(), default=DEFAULT_RATE_HZ))
     try:

@@ -21,6 +21,8 @@ ANSWER_S: Final = 30.0
 SHOWN_BYTES: Final = 300
 """Longest part of an answer, in bytes, that an error repeats."""
 
+READ_BYTES: Final = 1 << 20
+"""Longest part of a refusal's answer, in bytes, in which its reason is sought."""
 
 TEMPORARY: Final = frozenset({408, 425, 429})
 """Statuses below 500 that may be gone at the next attempt."""
@@ -101,8 +103,7 @@ class Address:
             with open_url(request, ANSWER_S, self.context) as response:
                 return bytes(response.read())
         except urllib.error.HTTPError as error:
-            with error:
-                said = redirection(error) or f": {_detail(error.read(SHOWN_BYTES))}"
+            said = redirection(error) or f": {reason_of(error, SHOWN_BYTES)}"
             what = f"{address}: the server answered {error.code}{said}"
             if may_pass(error.code):
                 raise UnavailableError(what) from error
@@ -152,6 +153,28 @@ def redirection(error: urllib.error.HTTPError) -> str:
     return "" if target is None else f", a redirect to {target}; give that server's address if you trust it"
 
 
+def reason_of(error: urllib.error.HTTPError, shown_bytes: int = 0) -> str:
+    """Return the reason that a server gives for a refusal.
+
+    Whatever answers, livessl or another program, and however the answer ends, there is no further error.
+
+    Parameters
+    ----------
+    error : HTTPError
+        The refusal; its answer is read and closed.
+    shown_bytes : int
+        Longest beginning of an answer, in bytes, to return where it gives no reason.
+    """
+    body = b""
+    try:
+        with error:
+            body = error.read(READ_BYTES)
+        detail = json.loads(body)["detail"]
+        return detail if isinstance(detail, str) else "; ".join(str(fault["msg"]) for fault in detail)
+    except (OSError, ValueError, KeyError, TypeError, RecursionError, http.client.HTTPException):
+        return body[:shown_bytes].decode(errors="replace")
+
+
 def may_pass(status: int) -> bool:
     """Return whether a request that was answered with this status may succeed later."""
     return status >= 500 or status in TEMPORARY
@@ -170,13 +193,3 @@ def check_url(url: str) -> None:
         raise UseError(f"{example}, got {url!r}")
     if parts.username is not None or parts.query or parts.fragment:
         raise UseError(f"{example}, without a user, a query or a fragment, got one; give the token by itself")
-
-
-def _detail(body: bytes) -> str:
-    """Return the reason in an error's body."""
-    try:
-        found: Any = json.loads(body)
-        detail = found["detail"]
-    except (ValueError, KeyError, TypeError):
-        return body.decode(errors="replace")
-    return detail if isinstance(detail, str) else "; ".join(str(fault.get("msg", fault)) for fault in detail)

@@ -78,7 +78,7 @@ class Session:
                 for node in data.get("nodes", {}).values()
                 for name, numbers in node.get("arrays", {}).items()
             }
-        except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError, AttributeError, TypeError, ValueError):
+        except (OSError, yaml.YAMLError, RecursionError, AttributeError, TypeError, ValueError, OverflowError):
             return {}
 
 

@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable, Mapping
 from fractions import Fraction
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Final
 
 import numpy as np
@@ -42,7 +43,8 @@ def simulated_files(directory: Path) -> frozenset[Path]:
         return frozenset()
     if not (directory / TRUTH_FILE).is_file():
         return frozenset()
-    found = {directory / TRUTH_FILE, directory / SESSION_FILE, *map(session.path, session.pieces)}
+    recordings = {piece.file for piece in session.pieces if piece.file == f"{Path(piece.array).name}.wav"}
+    found = {directory / name for name in (TRUTH_FILE, SESSION_FILE, *recordings)}
     found |= {directory / SITE_FILE} if holds_copied_site(directory) else set()
     return frozenset(path for path in found if not path.is_symlink())
 
@@ -57,6 +59,9 @@ def write_scene(
     progress: Callable[[int, int], None] | None = None,
 ) -> None:
     """Render a scene for every array of a site into a folder: `ARRAY.wav` (16 bit), `truth.jsonl`, and a session.
+
+    A simulated session that is there is replaced with all its files once the new one is complete, and stays as it is if
+    that fails or is interrupted.
 
     Parameters
     ----------
@@ -76,15 +81,42 @@ def write_scene(
         If the folder cannot be written.
     """
     directory.mkdir(parents=True, exist_ok=True)
+    with TemporaryDirectory(prefix="unfinished-", dir=directory) as unfinished:
+        _write(Path(unfinished), site, scene, seed, rates_hz or {}, progress)
+        _take_place(Path(unfinished), directory)
+
+
+def _write(
+    directory: Path,
+    site: Site,
+    scene: Scene,
+    seed: int,
+    rates_hz: Mapping[str, float],
+    progress: Callable[[int, int], None] | None,
+) -> None:
     pieces = []
     for spec, samples in rendered(site, scene, seed=seed, progress=progress):
-        rate_hz = (rates_hz or {}).get(spec.name, scene.sample_rate_hz)
+        rate_hz = rates_hz.get(spec.name, scene.sample_rate_hz)
         resampled = _resampled(samples, scene.sample_rate_hz, rate_hz)
         soundfile.write(directory / f"{spec.name}.wav", resampled.T, round(rate_hz), subtype="PCM_16")
         pieces.append(piece(spec.name, f"{spec.name}.wav", NOMINAL_START_NS))
     lines = "".join(json.dumps(entry) + "\n" for entry in truth(scene))
     (directory / TRUTH_FILE).write_text(lines, encoding="utf-8")
     write_session(directory, site, pieces)
+
+
+def _take_place(finished: Path, directory: Path) -> None:
+    """Move a session to its place, in an order that lets `simulated_files` know its files again at almost any end.
+
+    The recordings before go first, and the new ones come last: a session never has recordings of another one.
+    """
+    before = simulated_files(directory)
+    described = [TRUTH_FILE, SESSION_FILE, SITE_FILE]
+    for path in before - {directory / name for name in described}:
+        path.unlink(missing_ok=True)
+    recordings = sorted({path.name for path in finished.iterdir()} - set(described))
+    for name in (*described, *recordings):
+        (finished / name).replace(directory / name)
 
 
 def _resampled(samples: Float32Array, from_hz: float, to_hz: float) -> Float32Array:

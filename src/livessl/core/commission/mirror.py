@@ -23,8 +23,8 @@ MOST_TURN_DEG: Final = 25.0
 are further off less often than they exchange channels."""
 
 SAME_M: Final = 0.02
-"""Distance, in metres, within which centres are in one plane, and microphones at the same place. In small arrays a third
-of the least distance between microphones counts instead, so that neighbours are not taken for each other."""
+"""Distance, in metres, within which centres are in one plane, and microphones at the same place. In small arrays a
+third of the least distance between microphones counts instead, so that neighbours are not taken for each other."""
 
 BEYOND_M: Final = 0.3
 """Distance, in metres, by which a place may be outside the search volume: places of single sounds have errors."""
