@@ -33,7 +33,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as in a shell's backgro
 
 # A busy machine is no fault of the code. With chance in the examples, a change could fail for an old fault.
 # The examples are the same each time, so few are tried here; `search` tries new ones.
-settings.register_profile("livessl", deadline=None, derandomize=True, max_examples=40)
+settings.register_profile("livessl", deadline=None, derandomize=True, max_examples=20)
 settings.register_profile("search", deadline=None, print_blob=True)
 settings.load_profile("livessl")
 

@@ -121,7 +121,7 @@ def test_killed_node_leaves_whole_frames(tmp_path: Path) -> None:
     again.close()
 
 
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=25)
 @given(cut=st.integers(1, 5 * SIZE), flip=st.none() | st.integers(0, 5 * SIZE))
 def test_torn_or_changed_tail_ends_a_segment(
     tmp_path_factory: pytest.TempPathFactory, cut: int, flip: int | None

@@ -43,7 +43,7 @@ def test_room_that_cannot_have_the_reverberation_time_is_said_and_valid(run: Run
     assert "expected error: not predicted, " in done.out
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(
     place_m=st.tuples(st.floats(0.2, 3.8), st.floats(0.2, 4.8), st.floats(0.25, 2.7)),
     axis=st.integers(0, 2),
@@ -55,7 +55,7 @@ def test_nearest_wall_is_the_smallest_gap_of_any_microphone(place_m: tuple[float
     assert nearest_wall(spec, site_of()).distance_m == pytest.approx(gaps.min())
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(place_m=st.tuples(st.floats(0.3, 3.7), st.floats(0.3, 4.7)))
 def test_array_is_drawn_where_it_is(place_m: tuple[float, float]) -> None:
     site = site_of({"arrays.north.position_m": [*place_m, 1.2], "zones": {}})

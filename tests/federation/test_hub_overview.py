@@ -155,7 +155,7 @@ def _rows(connection: Connection, table: Any) -> list[Any]:
     return [tuple(row) for row in connection.execute(select(table).order_by(*table.primary_key.columns))]
 
 
-@settings(max_examples=60)
+@settings(max_examples=25)
 @given(drawn=batches, middle=st.integers(0, 12))
 def test_messages_stored_together_leave_what_they_leave_one_by_one(
     database: Connection, drawn: list[tuple[str, str, JsonObject]], middle: int

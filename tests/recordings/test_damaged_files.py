@@ -67,7 +67,7 @@ def sounds(draw: st.DrawFn) -> tuple[Float32Array, int, tuple[str, str, int]]:
     return samples, rate_hz, draw(st.sampled_from(CONTAINERS))
 
 
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=25)
 @given(sound=sounds(), where=st.floats(0, 1))
 @example(sound=(noise(1, 1, 0), 8000, ("WAV", "PCM_24", 3)), where=47 / 48)  # an odd number of bytes is padded
 @example(sound=(noise(1, 1, 0), 8000, ("WAV", "PCM_24", 3)), where=1.0)
@@ -104,7 +104,7 @@ def test_file_cut_at_any_byte_is_read_up_to_there_or_refused(
     assert note is None or f"{path}: {CUT}; {len(got) / rate_hz:.2f} s of sound were found and read" == note
 
 
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=25)
 @given(
     sound=sounds(),
     riff=st.sampled_from([0, 36, 4096, 0xFFFFFFF8]),
@@ -139,7 +139,7 @@ def test_header_that_was_never_finished_hides_nothing(
     assert note == f"{path}: {fault}; {len(samples) / rate_hz:.2f} s of sound were found and read"
 
 
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=25)
 @given(sound=sounds(), title=st.text("abc ", min_size=0, max_size=9))
 def test_good_file_gets_no_note(tmp_path_factory: pytest.TempPathFactory, sound: Any, title: str) -> None:
     """Chunks behind the sound are no sound, whether or not the length of the whole counts them."""

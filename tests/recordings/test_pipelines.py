@@ -94,7 +94,7 @@ def test_frames_hold_the_sound_of_their_channels() -> None:
 
 
 @given(st.lists(st.integers(1, SCENE.shape[1] - 1), unique=True, max_size=60))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 def test_frames_do_not_depend_on_block_boundaries(cuts: list[int]) -> None:
     made = messages(cuts, BOTH)
     for array in BOTH:

@@ -74,7 +74,7 @@ def test_size_of_an_array_in_another_unit_is_recognized(edge_m: float, unit: str
     assert said.endswith(f"its size is {edge_m} m; give metres, not {unit}")
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(degrees=st.sampled_from([45, 90, 135, 180, 225, 270, 315, -45, -90, -135, -180]), decimals=st.integers(2, 6))
 def test_common_angles_in_radians_are_recognized(degrees: int, decimals: int) -> None:
     radians = round(math.radians(degrees), decimals)
@@ -85,7 +85,7 @@ def test_common_angles_in_radians_are_recognized(degrees: int, decimals: int) ->
     )
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(tenths=st.integers(-3600, 3600))
 def test_angles_in_degrees_with_one_decimal_are_not_doubted(tenths: int) -> None:
     assert said_of({f"{NORTH}.orientation_deg": {"yaw": tenths / 10}}) == []

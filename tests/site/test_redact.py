@@ -26,7 +26,7 @@ PLACES: dict[str, str] = {
 """Keys whose values may hold a secret, those included that the site file does not have."""
 
 
-@settings(max_examples=30)
+@settings(max_examples=15)
 @given(st.dictionaries(st.sampled_from(sorted(PLACES)), SECRETS, min_size=1))
 def test_no_secret_is_left_in_the_site_file_or_in_a_text_that_repeats_it(secrets: dict[str, str]) -> None:
     data = small({place: PLACES[place].format(secret) for place, secret in secrets.items()})

@@ -77,7 +77,7 @@ def test_decimal_commas_are_named(line: str, where: str) -> None:
     assert "decimal point" in said
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(whole=st.integers(-20, 40), decimals=st.integers(0, 99))
 def test_a_number_with_a_decimal_comma_is_shown_with_a_point(whole: int, decimals: int) -> None:
     line = f"{TETRAHEDRON}, position_m: [4, 2, 2]"

@@ -44,7 +44,7 @@ class Desk:
         return self.watch.findings(NODES, self.time_s)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(fault=st.sampled_from(sorted(FAULTY)), channel=st.integers(1, 4), size=st.floats(1.01, 9.9))
 def test_lasting_fault_is_found_on_its_channel_until_it_ends(fault: str, channel: int, size: float) -> None:
     desk = Desk()
@@ -79,7 +79,7 @@ def test_fault_just_below_its_limit_is_not_found() -> None:
     assert desk.found() == []
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(before=st.integers(0, 10**6), clipped=st.integers(MOST_CLIPPED + 1, 10**6), channel=st.integers(1, 4))
 def test_clipping_is_found_for_a_minute(before: int, clipped: int, channel: int) -> None:
     desk = Desk()

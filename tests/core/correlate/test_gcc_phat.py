@@ -84,7 +84,7 @@ def test_the_sound_reaches_the_nearer_microphone_first() -> None:
     assert peak_lags_s(correlate(spec, heard(spec, [3.0, 0.4, 0.2], burst(4000))))[0] < -0.2 / C_M_S
 
 
-@settings(deadline=None, max_examples=40)
+@settings(deadline=None, max_examples=20)
 @given(lag_samples=st.floats(-13.0, 13.0), seed=st.integers(0, 10**6))
 def test_lags_of_a_fraction_of_a_sample_are_found(lag_samples: float, seed: int) -> None:
     gcc = correlate(pair(), delayed(burst(2400, seed), [0.0, lag_samples / RATE_HZ]))

@@ -107,7 +107,7 @@ def test_the_noise_that_was_learned_is_subtracted(kernels: ModuleType) -> None:
     state, rng = fresh_state(), np.random.default_rng(4)
     mixing = rng.standard_normal((3, 2)) + 1j * rng.standard_normal((3, 2))  # two sources of noise
     drawn = rng.standard_normal((2, 4000, LOW + BINS + 5)) + 1j * rng.standard_normal((2, 4000, LOW + BINS + 5))
-    spectra = np.einsum("ms,stf->tmf", mixing, drawn).astype(np.complex64)
+    spectra = np.einsum("ms,stf->tmf", mixing, drawn).astype(np.complex64, order="C")
     parameters = PARAMETERS._replace(noise_hops=4000, loud=np.float32(1e9))
     weights, noises = np.empty((2, 4000, BINS), np.float32)
     kernels.onset_weights(spectra, LOW, LEARNED, True, parameters, state, weights, noises)

@@ -84,7 +84,7 @@ def test_peaks_of_a_map_are_those_of_brute_force(
     assert all(power[a] >= power[b] for a, b in pairwise(points))
 
 
-@settings(deadline=None, max_examples=50)
+@settings(deadline=None, max_examples=25)
 @given(seed=st.integers(0, 10**6))
 def test_refining_climbs_and_stays_inside(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -105,7 +105,7 @@ def test_a_source_outside_the_grid_is_found_on_its_boundary() -> None:
     assert position_m[0] == 0.0
 
 
-@settings(deadline=None, max_examples=50)
+@settings(deadline=None, max_examples=25)
 @given(seed=st.integers(0, 10**6))
 def test_two_arrays_find_a_source_off_the_grid(seed: int) -> None:
     source_m = np.random.default_rng(seed).uniform([0.3, 2.0, 0.4], [1.6, 3.6, 2.3])
@@ -173,7 +173,7 @@ def test_the_confidence_of_an_empty_map_is_zero() -> None:
     assert stands_out(hills((SECOND_M, 1.0)), np.array(FIRST_M)) == 0.0  # the peak is elsewhere
 
 
-@settings(deadline=None, max_examples=50)
+@settings(deadline=None, max_examples=25)
 @given(noise=st.floats(0.0, 1.0), seed=st.integers(0, 10**6), both=st.booleans())
 def test_the_covariance_is_positive_and_no_wider_than_the_volume(noise: float, seed: int, both: bool) -> None:
     place_m = np.random.default_rng(seed).uniform(GRID.lower_m, GRID.upper_m)

@@ -133,7 +133,7 @@ def test_there_is_no_error_along_an_axis_that_is_not_searched() -> None:
     np.testing.assert_array_equal(covariance_m2[2], np.zeros(3))
 
 
-@settings(max_examples=30)
+@settings(max_examples=15)
 @given(
     deviations_m=st.tuples(*[st.floats(0.001, 2.0)] * 3),
     turned=st.tuples(*[st.floats(-1.0, 1.0)] * 3),

@@ -39,7 +39,7 @@ def after_quiet(faults: ChannelFaults, frames: Sequence[Float32Array], array: st
     return faults.of(array)
 
 
-@settings(max_examples=40)
+@settings(max_examples=20)
 @given(
     seed=st.integers(0, 1 << 30),
     taken=st.lists(st.integers(0, 5), min_size=2, max_size=8),
@@ -69,7 +69,7 @@ def test_copies_are_named_as_the_first_sound_begins(
     assert {int(word) for word in named.replace(",", " ").replace(";", " ").split() if word.isdigit()} == copied
 
 
-@settings(max_examples=40)
+@settings(max_examples=20)
 @given(
     seed=st.integers(0, 1 << 30),
     hum_hz=st.sampled_from([50.0, 60.0, 100.0, 120.0, 1000.0, 5000.0]),
@@ -122,7 +122,7 @@ def test_a_fault_ends_when_the_channels_differ_again() -> None:
     assert faults.of("north") is None
 
 
-@settings(max_examples=30)
+@settings(max_examples=15)
 @given(seed=st.integers(0, 1 << 30), arrays=st.integers(2, 12), order=st.permutations(range(4)))
 def test_two_arrays_on_the_same_channels_are_named(seed: int, arrays: int, order: list[int]) -> None:
     """In whatever order the channels and the messages are, and beside any number of other arrays."""

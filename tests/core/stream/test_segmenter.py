@@ -172,7 +172,7 @@ def test_wrong_number_of_channels_is_refused() -> None:
         Segmenter(SPEC, CHANNELS[:2], RATE_HZ, PARAMETERS)
 
 
-@settings(deadline=None, max_examples=40)
+@settings(deadline=None, max_examples=20)
 @given(
     loud=st.lists(st.booleans(), min_size=WARM_UP_FRAMES, max_size=50),
     sizes=st.lists(st.integers(1, 3000), max_size=20),

@@ -66,7 +66,7 @@ def is_burst(run: tuple[int, int]) -> bool:
     return any(start_s - 0.06 <= 0.05 * run[0] and 0.05 * run[1] <= start_s + 0.36 for start_s in BURSTS_S)
 
 
-@settings(max_examples=30)
+@settings(max_examples=15)
 @given(
     seed=st.integers(0, 1 << 30),
     hum_hz=st.sampled_from([50.0, 60.0, 100.0, 120.0, 150.0, 1000.0, 2345.6, 5000.0]),
@@ -133,7 +133,7 @@ def test_a_sound_goes_on_while_a_hum_is_recognized(seed: int, level_db: float, h
     extra=st.integers(-1, 1),
     seed=st.integers(0, 1 << 30),
 )
-@settings(max_examples=30)
+@settings(max_examples=15)
 def test_the_spectrum_is_that_of_the_frame_with_a_hann_window(
     rate_hz: float, high_hz: float, extra: int, seed: int
 ) -> None:

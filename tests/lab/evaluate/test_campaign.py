@@ -20,7 +20,7 @@ from livessl.lab.evaluate.campaign import run_campaign
 from livessl.lab.evaluate.job import read_clips
 from small_site import HANG_S, started, wait_until
 
-POSITIONS = 16
+POSITIONS = 10
 
 
 @pytest.fixture

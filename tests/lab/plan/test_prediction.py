@@ -337,7 +337,7 @@ def test_in_a_plane_the_height_is_known() -> None:
     assert (prediction.position_error_m(covariance) < prediction.position_error_m(volume)).all()
 
 
-@settings(deadline=None, max_examples=30)
+@settings(deadline=None, max_examples=15)
 @given(x=st.floats(0.5, 7.5), y=st.floats(0.5, 9.5), yaw=st.floats(0, 360))
 def test_another_array_never_makes_it_worse(x: float, y: float, yaw: float) -> None:
     one = prediction.information_1_m2(NORTH, FLOOR_M, CONDITIONS)

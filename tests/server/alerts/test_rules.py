@@ -63,7 +63,7 @@ def test_conditions(condition: dict[str, Any], event: Event, expected: bool) -> 
     assert matches(condition, event) is expected
 
 
-@settings(max_examples=40)
+@settings(max_examples=20)
 @given(std_m=st.floats(0.01, 2.0), threshold=st.floats(0.05, 0.95))
 def test_uncertain_position_is_in_the_zone_only_with_enough_probability(std_m: float, threshold: float) -> None:
     """The door's walls are at 0, its free sides at 1 m: within them is the square of one axis, and z hardly counts."""
@@ -142,7 +142,7 @@ def test_a_final_event_takes_the_place_of_the_early_one_that_it_replaces() -> No
     assert judge_event(counting, state, encoded(other), other.start_ns, "UTC")[0] is Verdict.ALERT
 
 
-@settings(max_examples=40)
+@settings(max_examples=20)
 @given(st.lists(st.integers(0, 8), min_size=1, max_size=30), st.integers(2, 4), st.sampled_from([0.0, 1e-3]))
 def test_an_event_counts_towards_one_alert_however_often_it_is_judged(
     numbers: list[int], count: int, hold_off_s: float

@@ -56,7 +56,7 @@ def test_answers_are_as_described(api: Any, headers: dict[str, str]) -> None:
     assert len(operations) == sum(len(methods) for methods in api.raw_schema["paths"].values()) > 30
     for operation in operations:
 
-        @settings(max_examples=9, phases=[Phase.generate], suppress_health_check=list(HealthCheck))
+        @settings(max_examples=5, phases=[Phase.generate], suppress_health_check=list(HealthCheck))
         @given(case=operation.as_strategy())
         def answers_as_described(case: Any) -> None:
             case.call_and_validate(headers=headers, excluded_checks=TOO_STRICT.get(case.operation.path, []))

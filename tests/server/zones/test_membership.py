@@ -44,7 +44,7 @@ def rotation(seed: int) -> np.ndarray:
     return q
 
 
-@settings(max_examples=60)
+@settings(max_examples=25)
 @given(
     mean=st.tuples(coordinate, coordinate, coordinate),
     stds=st.tuples(std_m, std_m, std_m),
@@ -61,7 +61,7 @@ def test_equals_the_normal_distribution_of_scipy(mean, stds, seed, low, size) ->
     assert found == pytest.approx(known.cdf(high_m, lower_limit=low_m), abs=TOLERANCE)
 
 
-@settings(max_examples=40)
+@settings(max_examples=20)
 @given(
     mean=st.tuples(coordinate, coordinate, coordinate),
     stds=st.tuples(st.floats(1e-6, 1e-2), st.floats(1e-3, 0.1), st.floats(1.0, 30.0)),
@@ -122,7 +122,7 @@ def test_a_position_outside_the_volume_is_in_no_zone() -> None:
     assert probability_in(np.array([-3.0, 2.0, 1.0]), 0.01 * np.eye(3), box_prism(zone), ROOM) == 0.0
 
 
-@settings(max_examples=30)
+@settings(max_examples=15)
 @given(
     mean=st.tuples(coordinate, coordinate, coordinate),
     stds=st.tuples(std_m, std_m, std_m),
@@ -145,7 +145,7 @@ def test_polygon_equals_the_share_of_samples_inside(mean, stds, seed, radii, hei
     assert found == pytest.approx(within.mean(), abs=4.5 * 0.5 / np.sqrt(len(samples)) + TOLERANCE)
 
 
-@settings(max_examples=30)
+@settings(max_examples=15)
 @given(turn=st.floats(0.0, 6.3), share=st.floats(0.1, 0.9), seed=st.integers(0, 10**6), backwards=st.booleans())
 def test_parts_of_a_polygon_have_probabilities_that_add_up(
     turn: float, share: float, seed: int, backwards: bool
@@ -166,7 +166,7 @@ def test_parts_of_a_polygon_have_probabilities_that_add_up(
     assert found[0] == pytest.approx(found[1] + found[2], abs=TOLERANCE)
 
 
-@settings(max_examples=40)
+@settings(max_examples=20)
 @given(
     place=st.tuples(st.floats(0.1, 3.9), st.floats(0.1, 4.9), st.floats(0.1, 2.9)),
     std_m=st.floats(0.01, 0.2),
@@ -188,7 +188,7 @@ def test_zone_far_from_a_sure_position_has_no_probability() -> None:
     assert probability_in(np.array([0.5, 0.5, 1.0]), 0.01 * np.eye(3), zone, ROOM) == 0.0
 
 
-@settings(max_examples=40)
+@settings(max_examples=20)
 @given(
     zones=st.lists(
         st.tuples(

@@ -65,7 +65,7 @@ def test_track_loiters_once_in_a_stay() -> None:
     assert [report["stay_s"] for report in walk.reports] == [0.0, 3.0, 8.0, 0.0, 3.0]
 
 
-@settings(max_examples=40)
+@settings(max_examples=20)
 @given(st.lists(st.floats(0.9, 1.1), min_size=2, max_size=12), st.floats(0.2, 0.5))
 def test_track_at_an_edge_does_not_flicker(places: list[float], std_m: float) -> None:
     """The edge is at x = 1; half a standard deviation beside it, the probability is 0.31 or 0.69."""
