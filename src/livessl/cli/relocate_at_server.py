@@ -11,7 +11,7 @@ from urllib.parse import quote, urlencode
 
 from livessl.cli.output import complain
 from livessl.cli.server_answers import RefusedError, ask_for, order
-from livessl.clock import SystemClock, utc_text
+from livessl.clock import SystemClock, utc_ns, utc_text
 from livessl.errors import RunError, UseError
 from livessl.schema.answers import EventPage
 from livessl.schema.relocation import Relocated, RelocationSettings
@@ -162,7 +162,7 @@ class ServerArchive:
         event = f"events/{quote(event_id)}"
         try:
             about = _patiently(lambda: ask_for(Event, self.url, event, self.token_file))
-            found |= about.model_dump(mode="json", include={"time_utc"})
+            found["time_utc"] = None if about.time_utc is None else utc_text(utc_ns(about.time_utc.isoformat()))
             answer = _patiently(
                 lambda: order(Relocated, self.url, f"{event}/relocate", self.token_file, self._wanted, ANSWER_S)
             )
