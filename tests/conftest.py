@@ -79,6 +79,18 @@ LONGEST_FIRST = (
     "test_clocks_and_backfill.py",
     "test_overloaded_server.py",
     "test_killed_alerts.py",
+    "test_hub.py",
+    "test_calibrate_benchmark.py",
+    "test_noise.py",
+    "test_clips_of_a_process.py",
+    "test_accessibility.py",
+    "test_reverse_proxy.py",
+    "test_documentation.py",
+    "test_dashboard.py",
+    "test_clips_panel.py",
+    "test_set_up_view.py",
+    "test_relocate_command.py",
+    "test_contributing.py",
 )
 """Files that take minutes: begun first, no worker is left with one of them when the others are done."""
 
