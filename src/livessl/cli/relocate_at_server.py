@@ -14,7 +14,7 @@ from livessl.cli.server_answers import RefusedError, ask_for, order
 from livessl.clock import SystemClock, utc_ns, utc_text
 from livessl.errors import RunError, UseError
 from livessl.schema.answers import EventPage
-from livessl.schema.relocation import Relocated, RelocationSettings
+from livessl.schema.relocation import Relocated, RelocationSettings, unanswered
 from livessl.schema.values import Event
 from livessl.server.api.clip_schema import EventClips
 
@@ -145,20 +145,7 @@ class ServerArchive:
             yield self._relocate(event_id)
 
     def _relocate(self, event_id: str) -> JsonObject:
-        found: JsonObject = {
-            "kind": "relocation",
-            "event_id": event_id,
-            "time_utc": None,
-            "method": self.method,
-            "set_up": self.set_up,
-            "digest": self.digest,
-            "moved_arrays": [],
-            "stored": None,
-            "again": None,
-            "other_sources": [],
-            "distance_m": None,
-            "error": None,
-        }
+        found = unanswered(event_id, self.method, self.set_up, self.digest)
         event = f"events/{quote(event_id)}"
         try:
             about = _patiently(lambda: ask_for(Event, self.url, event, self.token_file))

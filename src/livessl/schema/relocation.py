@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -83,3 +83,31 @@ class Relocated(Versioned):
     )
     took_s: float = Field(ge=0, description="Time that the computation took, in seconds.", examples=[0.4])
     digest: Digest = None
+
+
+def unanswered(event_id: str, method: str | None, set_up: str, digest: str) -> dict[str, Any]:
+    """Return the object that `livessl relocate` prints for an event, as long as there is no answer.
+
+    Parameters
+    ----------
+    event_id : str
+    method : str or None
+        None takes the one by which the event was located.
+    set_up : "then" or "now"
+    digest : str
+        Of the settings that decide the answer.
+    """
+    return {
+        "kind": "relocation",
+        "event_id": event_id,
+        "time_utc": None,
+        "method": method,
+        "set_up": set_up,
+        "digest": digest,
+        "moved_arrays": [],
+        "stored": None,
+        "again": None,
+        "other_sources": [],
+        "distance_m": None,
+        "error": None,
+    }

@@ -10,6 +10,7 @@ from pathlib import Path
 from threadpoolctl import threadpool_limits
 
 from livessl.errors import ConfigError
+from livessl.schema.relocation import unanswered
 from livessl.server.api.encode import JsonObject, answer
 from livessl.server.clips.reader import ClipReader
 from livessl.server.clips.relocate import SetUp, digest_of, distance_m, relocate_sound
@@ -46,20 +47,7 @@ class Task:
 
 def relocate_one(task: Task, event_id: str) -> JsonObject:
     """Locate an event again; return both answers, or the first one and why there is no second."""
-    found: JsonObject = {
-        "kind": "relocation",
-        "event_id": event_id,
-        "time_utc": None,
-        "method": task.method,
-        "set_up": task.set_up,
-        "digest": task.digest,
-        "moved_arrays": [],
-        "stored": None,
-        "again": None,
-        "other_sources": [],
-        "distance_m": None,
-        "error": None,
-    }
+    found = unanswered(event_id, task.method, task.set_up, task.digest)
     try:
         clip = stored_clip(ClipReader(task.folder), event_id)
         found |= {"time_utc": clip.content.get("time_utc"), "stored": clip.content.get("answer")}
