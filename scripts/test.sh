@@ -50,5 +50,5 @@ mypy & # needs one processor only, for a minute: the tests begin meanwhile
 typing=$!
 lint-imports
 wait "$compiling"
-pytest -n 4 --dist loadfile --no-loadscope-reorder "$@"
+pytest -n 6 --dist loadfile --no-loadscope-reorder "$@"
 wait "$typing" || { echo "test: mypy found errors, which stand before the tests' output or within it" >&2; exit 1; }

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from playwright.sync_api import Browser, Error, FloatRect, Locator, Page, Request, sync_playwright
 
 from conftest import require
-from small_site import wait_until
+from small_site import HANG_S, wait_until
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 
@@ -31,6 +31,8 @@ def running_browser() -> Iterator[Browser]:
 def faultless_page(browser: Browser) -> Iterator[Page]:
     """Open a page; the test fails if the page's code has raised an error, and then also says which requests failed."""
     page = browser.new_page()
+    page.set_default_timeout(1000 * HANG_S)
+    page.set_default_navigation_timeout(1000 * HANG_S)
     faults: list[str] = []
     failed: list[str] = []
     page.on("pageerror", lambda error: faults.append(str(error)))

@@ -15,8 +15,9 @@ from processes import Event, Playing, make_recordings, play, wait_for
 from livessl.core.stream.array_health import LOST_NS
 from livessl.server.array_states import WATCH_NS
 from livessl.server.engine import WAIT_S
+from small_site import HANG_S
 
-pytestmark = [pytest.mark.processes, pytest.mark.timeout(280)]
+pytestmark = [pytest.mark.processes, pytest.mark.timeout(900)]
 
 COUNT = 4
 
@@ -115,8 +116,9 @@ def array_state(site: Playing, name: str) -> dict[str, Any]:
 
 
 def wait_for_states(site: Playing, **states: str) -> None:
-    """Wait until each array is in its state."""
-    wait_for(lambda: all(array_state(site, a).get("state") == state for a, state in states.items()), f"{states}", 60)
+    """Wait until each array is in its state, from the time on at which the nodes play."""
+    site.sleep_until(0.0)
+    wait_for(lambda: states == {name: array_state(site, name).get("state") for name in states}, f"{states}", HANG_S)
 
 
 def test_silence_shows_within_two_seconds_where_the_machine_is_free() -> None:

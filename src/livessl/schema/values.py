@@ -327,7 +327,9 @@ class Counters(Model):
         ge=0, description="Buffered frames of a time whose final results were published without them.", examples=[0]
     )
     shed: int = Field(
-        ge=0, description="Frames whose sound was not used because the server was overloaded.", examples=[0]
+        ge=0,
+        description="Frames whose sound was not used because the server was overloaded, or held too many.",
+        examples=[0],
     )
 
 

@@ -10,7 +10,7 @@ from test_fusion import HANG_OVER, START, Arrivals, frame, mark, node, now_ns, s
 
 from livessl.core.stream.array_health import LOST_NS
 from livessl.core.stream.final_pass import FinalResults, TwoPassFusion
-from livessl.core.stream.held_frames import HOLD_BYTES, HOLD_NS
+from livessl.core.stream.held_frames import HEADER_BYTES, HOLD_BYTES, HOLD_NS
 from livessl.core.types import FRAME_NS, Event, Frame, Message
 
 NAMES = ("north", "south")
@@ -108,12 +108,25 @@ def test_hold_is_longer_than_a_restart_takes() -> None:
 
 
 def test_memory_of_held_frames_is_bounded() -> None:
-    size = frame("north", 0).samples.nbytes
+    size = HEADER_BYTES + frame("north", 0).samples.nbytes
     into = two_passes(hold_bytes=50 * size)
     play(into, node("south", (), range(5)), 5)
     said = play(into, node("north", range(10, 400), range(5, 420)), 420, 5)
     assert into.input.held.nbytes <= 50 * size
     assert len(settled_events(said)) >= 1
+
+
+def test_backlog_of_a_time_that_was_given_up_is_counted_as_too_late() -> None:
+    """Its node sends live sound meanwhile: the frames are older than the newest, and yet they have not come before."""
+    into = two_passes(hold_bytes=50 * (HEADER_BYTES + frame("north", 0).samples.nbytes))
+    play(into, both((), range(5)), 5)
+    into.greet("south", (START + 6, START + 200), now_ns(6))
+    sounds = [message for k in range(0, 200, 50) for message in node("north", range(k + 10, k + 30), range(k, k + 50))]
+    play(into, sounds + node("south", (), range(200, 250)), 250, 6)
+    assert into.input.too_late == {"north": 0, "south": 0}
+    play(into, [(251.0, frame("south", k)) for k in range(10, 20)], 251, 251)
+    assert into.input.too_late == {"north": 0, "south": 10}
+    assert into.input.duplicates == {"north": 0, "south": 0}
 
 
 def test_array_whose_node_has_ended_is_not_awaited() -> None:

@@ -49,6 +49,8 @@ class FinalInput:
         """Number of frames of each array that came as backlog."""
         self.too_late = dict.fromkeys(self._receptions, 0)
         """Number of new frames of each array that came after the results of their time were final."""
+        self.thinned = dict.fromkeys(self._receptions, 0)
+        """Number of frames of each array whose samples were dropped, because too many frames were held."""
         self.start_over()
 
     def start_over(self) -> None:
@@ -114,7 +116,9 @@ class FinalInput:
         Arrays that are away are awaited until the frames of the others are overdue. `position` is the frame index up to
         which the final pass has gone.
         """
-        self.held.expire(now_ns, position, shedding=self._state.relief.arrays is not None)
+        dropped = self.held.expire(now_ns, position, shedding=self._state.relief.arrays is not None)
+        for name, frames in dropped.items():
+            self.thinned[name] += frames
         connected: list[int | None] = []
         away: list[int | None] = []
         for name, reception in self._receptions.items():

@@ -21,6 +21,7 @@ class FinalReception:
     live_from: int | None = None  # frames before it are backlog
     last_message_ns: int | None = None
     has_left: bool = False
+    given_up: tuple[int, int] | None = None  # frame indices from and before which results are final without its frames
     seen: set[int] = field(default_factory=set)
 
     @property
@@ -71,8 +72,10 @@ class FinalReception:
         self.backlog_until = later(self.backlog_until, frame_index)
 
     def is_new(self, frame_index: int) -> bool:
-        """Return whether a frame has not come before and is newer than all live sound of the array so far."""
-        return frame_index not in self.seen and self.live_until is not None and self.live_until < frame_index
+        """Return whether a frame has not come before: it is newer than all live sound of the array, or was given up."""
+        is_newest = self.live_until is not None and self.live_until < frame_index
+        is_given_up = self.given_up is not None and self.given_up[0] <= frame_index < self.given_up[1]
+        return frame_index not in self.seen and (is_newest or is_given_up)
 
     def add(self, frame_index: int) -> None:
         """Add a new frame."""
@@ -81,14 +84,18 @@ class FinalReception:
             self.live_until = later(self.live_until, frame_index)
 
     def forget(self, before: int) -> None:
-        """Forget which frames before a frame index have been seen."""
+        """Forget which frames have been seen before the frame index before which all results are final."""
+        known = self.known_until
+        if known is not None and known + 1 < before:
+            first = known + 1 if self.given_up is None else min(self.given_up[0], known + 1)
+            self.given_up = first, before
         if self.seen:
             self.seen = {frame_index for frame_index in self.seen if frame_index >= before}
 
     def start_over(self) -> None:
         """Forget all frames, because the server's clock was set back."""
         self.seen.clear()
-        self.live_until = None
+        self.live_until = self.given_up = None
 
 
 def later(one: int | None, other: int | None) -> int | None:
