@@ -41,6 +41,7 @@ sh scripts/setup.sh dev
 [ -z "$missing" ] || wait "$installing"
 PATH="$PWD/.venv/bin:$PATH"
 export PATH
+unset PYTHONDONTWRITEBYTECODE # the tests start hundreds of processes, each of which would compile all modules
 set -x
 ruff check
 ruff format --check
@@ -49,6 +50,7 @@ compiling=$!
 mypy & # needs one processor only, for a minute: the tests begin meanwhile
 typing=$!
 lint-imports
+pytest --collect-only -qq "$@" >/dev/null || true # compiles the tests once, not in every worker
 wait "$compiling"
 pytest -n 6 --dist loadfile --no-loadscope-reorder "$@"
 wait "$typing" || { echo "test: mypy found errors, which stand before the tests' output or within it" >&2; exit 1; }

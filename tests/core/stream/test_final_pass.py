@@ -119,7 +119,7 @@ def test_memory_of_held_frames_is_bounded() -> None:
 def test_backlog_of_a_time_that_was_given_up_is_counted_as_too_late() -> None:
     """Its node sends live sound meanwhile: the frames are older than the newest, and yet they have not come before."""
     into = two_passes(hold_bytes=50 * (HEADER_BYTES + frame("north", 0).samples.nbytes))
-    play(into, both((), range(5)), 5)
+    play(into, both(range(0), range(5)), 5)
     into.greet("south", (START + 6, START + 200), now_ns(6))
     sounds = [message for k in range(0, 200, 50) for message in node("north", range(k + 10, k + 30), range(k, k + 50))]
     play(into, sounds + node("south", (), range(200, 250)), 250, 6)

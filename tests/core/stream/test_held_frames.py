@@ -67,7 +67,7 @@ def test_arrays_are_no_longer_awaited_when_samples_are_not_enough() -> None:
     assert held.forced_until == 1000 + 2 * FORCED_FRAMES + 1
 
 
-def test_samples_are_dropped_anew_only_after_more_have_come(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_samples_are_dropped_anew_only_after_more_have_come() -> None:
     held = HeldFrames(hold_bytes=10 * len(ARRAYS) * FRAME_BYTES)
     push_sound(held, 100, ARRAYS[:2])
     assert held.expire(0, None)
