@@ -60,16 +60,19 @@ AIMS_DB: Final = (6.0, 3.0)
 HEAD: Final = """\
 # How much clearer enhanced sound is
 
-The [enhanced signal](../clips.md#the-enhanced-signal) of an event against the best single one of all microphones,
+This page compares the [enhanced signal](../clips.md#the-enhanced-signal) of an event with the best single microphone,
 simulated in a room of 8 x 10 x 4 m with two tetrahedra of 0.5 m, 5 m apart. {positions} sounds (doors, keys, phones,
 voices, all synthesised) are at random places for each reverberation time; the place given to the beams is off by
-{place_m:g} m (standard deviation) on each axis, and the second array's clock by 3 ms. The third column is the ratio at
-the best microphone. `python benchmarks/clips.py --positions {positions} --seed {seed} --write docs/accuracy/clips.md`
-writes this page; its first lines say how it is measured. Constants were chosen with other scenes, of seed 1.
+{place_m:g} m (standard deviation) on each axis, and the second array's clock by 3 ms. The column *SNR* is the
+ratio at the best microphone; *both arrays* is the share of sounds for which the beams of both arrays were added.
+`python benchmarks/clips.py --positions {positions} --seed {seed} --write docs/accuracy/clips.md`
+writes this page; the first lines of that program say how it measures. Constants were chosen with other scenes, of
+seed 1.
 
-SNR is the sound with its reflections of the first {early_ms} ms over the noise; SNIR the same over noise and later
-reverberation together. Both are taken in the band of 100 to 6000 Hz while the sound lasts. The weights are computed
-from the mixture alone and then applied to the parts. Gains in dB: median (10th to 90th percentile of the sounds).
+The SNR is the ratio of the sound with its reflections of the first {early_ms} ms to the noise; the SNIR is its ratio to
+noise and later reverberation together. Both are taken in the band of 100 to 6000 Hz while the sound lasts. The weights
+are computed from the mixture alone and then applied to the parts. Gains in dB: median (10th to 90th percentile of the
+sounds).
 
 | RT60 | noise | SNR | SNR: delay-and-sum | **SNR: the clips** | SNIR: delay-and-sum | SNIR: the clips | both arrays |
 |---|---|---|---|---|---|---|---|"""
@@ -82,8 +85,9 @@ Over all kinds of noise and ratios, the SNR gain of the clips' beams against wha
 {summary}
 
 Four microphones of equal noise can gain 6 dB over their mean, and a second array that is as near as the first 3 dB
-more. The best microphone is better than the mean of its array, and mostly one array is nearer than the other. In long
-reverberation at 0 dB the beams of two arrays often do not correlate enough to be aligned; the better one is then alone.
+more. The gain over the best microphone is smaller, because that microphone is better than the mean of its array, and
+because one array is mostly nearer than the other. In long reverberation at 0 dB the beams of two arrays often do not
+correlate enough to be aligned; the better one is then alone.
 """
 
 

@@ -233,4 +233,4 @@ def test_a_site_file_of_another_server_is_told(server: Server, run: Run, tmp_pat
     assert done.code == 2
     assert "expected the site file that the server at" in done.err
     open_port = run("calibrate", "verify", "--site", site, "--at=1,1,1")
-    assert (open_port.code, "leaves the server's port open" in open_port.err) == (2, True)
+    assert (open_port.code, "no fixed port of the server" in open_port.err) == (2, True)

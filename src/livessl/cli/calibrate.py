@@ -164,7 +164,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _server_of_file(arguments: argparse.Namespace) -> str | None:
-    """Return the address of the server; None if neither it nor a valid site file is given."""
+    """Return the address of the server; None without --url and without a valid site file."""
     if arguments.site is None:
         return None if arguments.url is None else str(arguments.url)
     try:
@@ -200,7 +200,9 @@ def _server(arguments: argparse.Namespace) -> tuple[Site, ServerSounds]:
     print_warnings(site)
     url = _address(arguments, site)
     if url is None:
-        raise UseError("calibrate: the site file leaves the server's port open; give its address as --url")
+        raise UseError(
+            "calibrate: the site file has no fixed port of the server (server.http.port: 0); give its address as --url"
+        )
     sounds = ServerSounds(url, arguments.token_file, arguments.wait)
     mine, served = ({spec.name: len(spec.microphones_m) for spec in one.processed} for one in (site, sounds.site()))
     if mine != served:
@@ -212,7 +214,7 @@ def _server(arguments: argparse.Namespace) -> tuple[Site, ServerSounds]:
 
 
 def _address(arguments: argparse.Namespace, site: Site) -> str | None:
-    """Return the address of the site's server, as it is given or by the site file; None if the port is left open."""
+    """Return the address of the server, from --url or the site file; None if the system chooses the port (0)."""
     if arguments.url is not None:
         return str(arguments.url)
     http = site.server.http
@@ -324,7 +326,7 @@ def _poses(arguments: argparse.Namespace) -> int:
         where = "" if place_m is None else f", next at {', '.join(f'{x:.1f}' for x in place_m)}"
         return f"clap at more places, on all its sides, near and far, high and low{where}"
 
-    return _told(arguments, site, measured, "poses", cure)
+    return _report(arguments, site, measured, "poses", cure)
 
 
 def _refine(arguments: argparse.Namespace) -> int:
@@ -349,7 +351,7 @@ def _refine(arguments: argparse.Namespace) -> int:
     if not arguments.known:
         complain(f"{known[0]!r} is taken to be where the site file says; --known ARRAY names another", kind="note")
     measured = refined(site, sounds, known, arguments.position_std, parts)
-    return _told(arguments, site, measured, "refine", lambda: "make more sounds, all over the room, near and far")
+    return _report(arguments, site, measured, "refine", lambda: "make more sounds, all over the room, near and far")
 
 
 def _kept_and_new(server: ServerSounds, count: int) -> list[HeardSound]:
@@ -365,10 +367,10 @@ def _kept_and_new(server: ServerSounds, count: int) -> list[HeardSound]:
     return sounds
 
 
-def _told(
+def _report(
     arguments: argparse.Namespace, site: Site, measured: MeasuredSetUp, action: str, cure: Callable[[], str]
 ) -> int:
-    """Print what was measured, store it if that is wanted, and return the exit code."""
+    """Print the poses and the speed of sound, store them with --write, and return the exit code."""
     from livessl.cli import calibration_file
     from livessl.core.commission.resection import MOST_STD_DEG, MOST_STD_M
 

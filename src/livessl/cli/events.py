@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--url", default=URL, help=f"address of the server (default: {URL})")
     add("--token-file", type=Path, metavar="FILE", help="file that holds a token, if the server requires one")
-    add("--ca-file", type=Path, metavar="FILE", help="PEM file of the authority of the server's certificate")
+    add("--ca-file", type=Path, metavar="FILE", help="PEM file of the authority that signed the server's certificate")
     add(
         "--kinds",
         type=_kinds,
@@ -46,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--max-rate",
         type=argument.above_zero,
         metavar="HZ",
-        help="at most HZ updates a second of each sound, track and array",
+        help="print each sound, track and array at most HZ times a second",
     )
     add("--since", type=_time, metavar="TIME", help="begin with the stored events from this time on (RFC 3339)")
     add("--limit", type=argument.positive, metavar="N", help="end after N messages")

@@ -20,10 +20,10 @@ from livessl.errors import RunError, UseError
 from livessl.log_format import VARIABLE, LogForm, log_form, set_up_logging
 
 _FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT})
-"""Errors for want of space."""
+"""Error numbers of a full disk."""
 
 _OF_PATH: Final = frozenset({errno.ENOENT, errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.EISDIR, errno.EROFS})
-"""Errors that another path or other permissions cure."""
+"""Error numbers that another path or other permissions cure."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +96,7 @@ COMMANDS: Final = (
     ),
     Command(
         "support-bundle",
-        "write a zip with logs, settings and versions for whoever helps you",
+        "write a zip with logs, settings and versions, to send to someone who helps you",
         "livessl support-bundle --site site.yaml",
     ),
     Command("keys", "make, list and revoke keys and tokens", "livessl keys token --site site.yaml --name wall"),

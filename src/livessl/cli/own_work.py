@@ -1,4 +1,4 @@
-"""What a command may write over: empty files and those that it has made itself, and nothing else."""
+"""Checks that a command writes over nothing but empty files and those that it has made itself."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ PICTURE_HEAD: Final = 1024
 """Number of bytes at the beginning of a PNG in which its program is named."""
 
 NO_PICTURE: Final = "which does not say that livessl has drawn it"
-"""What `is_own_picture` has found out about another file."""
+"""Relative clause about a file for which `is_own_picture` returns False."""
 
 _EARLIER_DENSITY: Final = b"pHYs" + 2 * (4331).to_bytes(4, "big") + b"\1"
 """110 dots per inch in a PNG: pictures of livessl 0.1 and 0.2 name matplotlib, whose own default is 100, and this."""
@@ -34,7 +34,7 @@ def refuse_foreign(
     paths : iterable of Path
         Files that the command will write.
     is_own : callable
-        Returns whether an existing file can be told to be the command's own.
+        Returns whether an existing file is recognizably the command's own.
     site : Path or None
         The site file given, which is never written over, whoever has made it.
     foreign : str

@@ -85,9 +85,9 @@ def ask_for(model: type[M], url: str, path: str, token_file: Path | None) -> M:
     Raises
     ------
     UseError
-        As `fetch`.
+        If `fetch` raises it.
     RunError
-        As `fetch`, and if the answer is not what `model` describes.
+        If `fetch` raises it, or the answer is not what `model` describes.
     """
     from livessl.client.reading import read_answer
 

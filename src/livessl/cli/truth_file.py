@@ -1,4 +1,4 @@
-"""Reads the sounds of a simulated session from its `truth.jsonl`."""
+"""Reads the places and times of the sounds of a simulated session from its `truth.jsonl`."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def add_truth(parser: Any) -> None:
         "--truth",
         type=Path,
         metavar="FILE",
-        help="truth.jsonl of a simulated session, which has the places and times of its sounds, instead of --at",
+        help="truth.jsonl of a simulated session: the places and times of its sounds, instead of --at",
     )
 
 
@@ -29,7 +29,7 @@ def truth_given(arguments: argparse.Namespace) -> list[KnownSound]:
     Raises
     ------
     UseError
-        As `read_truth`, and if places are given by --at, too.
+        If `read_truth` raises it, if there are too many sounds, or if --at gives places as well.
     """
     from livessl.calibration import MOST_CLAPS
 
@@ -47,7 +47,7 @@ def read_truth(path: Path) -> list[KnownSound]:
     Raises
     ------
     UseError
-        If the file cannot be read, or holds something else.
+        If the file cannot be read, or is no such file.
     """
     import numpy as np
 

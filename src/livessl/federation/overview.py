@@ -1,4 +1,4 @@
-"""What the archive keeps of a site, and how the API describes it."""
+"""The overview of a site from the archive, as the API describes it."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Contact(NamedTuple):
 
     @property
     def is_away(self) -> bool:
-        """Whether nothing has come from the site for `AWAY_S`."""
+        """True if nothing has come from the site for `AWAY_S`."""
         return self.age_s > AWAY_S
 
     @property

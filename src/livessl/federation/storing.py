@@ -84,7 +84,7 @@ def put(connection: Connection, batch: Sequence[tuple[str, str, JsonObject]]) ->
 
 
 class _States:
-    """What some messages leave in a table that has the last message about each thing of a site.
+    """The rows that some messages leave in a table which has the last message about each thing of a site.
 
     Parameters
     ----------

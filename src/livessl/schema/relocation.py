@@ -42,7 +42,7 @@ Digest = Annotated[
 
 
 class RelocationSettings(Versioned):
-    """What events are located again with."""
+    """The settings with which events are located again."""
 
     digest: Digest = None
 

@@ -105,7 +105,7 @@ class Ingest:
         self.duplicates = dict.fromkeys(names, 0)
         self.sequence_gaps = dict.fromkeys(names, 0)
         self.shed = dict.fromkeys(names, 0)
-        """Live frames of each array whose samples were dropped for the load."""
+        """Live frames of each array whose samples were dropped because of overload."""
 
     def note_final(self, until: Mapping[str, int]) -> None:
         """Acknowledge from now on that nodes may delete the frames before these.

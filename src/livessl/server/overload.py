@@ -1,4 +1,4 @@
-"""The server's load: how far it is behind the sound, what it sheds for that, and what people are told about it.
+"""The server's load: how far it is behind the sound, what it sheds for that, and how it reports both.
 
 The fusion thread measures; `core.stream.load_policy` decides. Every thread may read the figures.
 """
@@ -72,7 +72,7 @@ class Overload:
         self.relief = NOTHING_SHED
         """The work that is shed now."""
         self.updates_shed = 0
-        """Windows that were not located for the load, since the start."""
+        """Number of windows that were not located because of overload, since the start."""
 
     def note(self, delay_s: float, messages: int, waited_ns: int, *, sheds: bool) -> Relief:
         """Take in a turn of the fusion thread; return what is shed from now on.

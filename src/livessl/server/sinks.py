@@ -58,7 +58,7 @@ class Sinks:
     def __init__(self, configs: Sequence[SinkConfig]) -> None:
         self._sinks = [(config.type, _opened(config)) for config in configs]
         self.failures = 0
-        """Events that a sink did not take."""
+        """Number of times that a sink failed to take an event."""
 
     def take(self, event: JsonObject) -> None:
         """Deliver an event to every sink."""

@@ -282,7 +282,7 @@ class Site(SiteFile):
     directory : Path
         Folder of the site file.
     c_m_s : float
-        Speed of sound, m/s: as given, from the temperature, or 343.
+        Speed of sound, m/s: as given, from the temperature, or 343; see `livessl.site.build.arrays`.
     specs : tuple of ArraySpec
         The arrays of the file with absolute positions, as they are recorded.
     processed : tuple of ArraySpec

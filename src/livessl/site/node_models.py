@@ -51,7 +51,7 @@ DeviceConfig = SoundDeviceConfig | WavDeviceConfig | SceneDeviceConfig
 
 
 class SpoolConfig(Model):
-    """Where a node keeps the frames that the server may still need: in a folder, or by default in memory."""
+    """The store of the frames that the server may still need: a folder, or by default memory."""
 
     directory: FileName | None = None
     max_mb: Positive = 512.0

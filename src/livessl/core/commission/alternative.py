@@ -1,4 +1,4 @@
-"""A set-up other than the one that is filed, and how large a difference is told."""
+"""A set-up other than the one that is filed, and how large a difference must be to be reported."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from typing import Final
 import numpy as np
 
 LEAST_TURN_DEG: Final = 3.0
-"""Smallest turn that is told."""
+"""Smallest turn, in degrees, that is reported."""
 
 LEAST_SHIFT_M: Final = 0.1
-"""Smallest shift that is told, metres."""
+"""Smallest shift, in metres, that is reported."""
 
 LEAST_DISPLACEMENT_M: Final = 0.02
-"""Smallest displacement of a single microphone that is told, metres."""
+"""Smallest displacement of a single microphone, in metres, that is reported."""
 
 LEAST_LATE_S: Final = 40e-6
-"""Smallest delay of a single channel that is told, seconds: two samples at 48 kHz."""
+"""Smallest delay of a single channel, in seconds, that is reported: two samples at 48 kHz."""
 
 LEAST_SPEED_M_S: Final = 6.0
-"""Smallest error of the speed of sound that is told, m/s: some 10 degrees of temperature."""
+"""Smallest error of the speed of sound, in m/s, that is reported: some 10 degrees of temperature."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 from typing import Final
 
 CURE: Final = "clap at places that you know, and run livessl calibrate verify"
-"""What shows a fault that sounds at unknown places hide."""
+"""Action that shows a fault which sounds at unknown places hide."""
 
 MOST_SHIFT_M: Final = 1000.0
-"""Least shift, in metres, from which on no shift would show, so that no size is told."""
+"""Least visible shift, in metres, beyond which its size is not reported: practically no shift would show."""
 
 MOST_TURN_DEG: Final = 180.0
-"""The same of turns, in degrees."""
+"""Least visible turn, in degrees, beyond which its size is not reported: no turn would show."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +40,7 @@ class BlindSpot:
 
     @property
     def message(self) -> str:
-        """What the sounds cannot show, in one sentence without a full stop."""
+        """One sentence, without a full stop, that says what the sounds cannot show."""
         names = " or ".join(repr(name) for name in self.arrays)
         along = ", ".join(f"{x:.2f}" for x in self.along)
         if self.fault == "mirrored":

@@ -25,11 +25,12 @@ from livessl.core.types import FloatArray
 
 MOST_HIDDEN_M: Final = 0.3
 MOST_HIDDEN_DEG: Final = 10.0
-"""Shift, in metres, and turn, in degrees, up to which nothing is said of what is hidden: sounds in all parts of a room
+"""Shift, in metres, and turn, in degrees, up to which hidden faults are not reported: sounds in all parts of a room
 show as much to three arrays."""
 
 SURELY: Final = 1.3
-"""Standard deviations by which a fault must exceed what is needed to be told, so that it is told nine times of ten."""
+"""Standard deviations by which a fault must exceed the least size that is reported, so that it is reported nine times
+of ten."""
 
 
 _SAME_DEG: Final = 15.0
@@ -90,9 +91,9 @@ def blind_spots(
 
 
 def _weakest(fault: str, array: str, seen: FloatArray, arrays: int) -> BlindSpot:
-    """Return the direction that shows least of a fault, and how large the fault must be there to be told.
+    """Return the direction in which a fault shows least, and how large the fault must be there to be reported.
 
-    `seen` (3, 3) is what the deviance grows by, for each metre or degree squared.
+    `seen` (3, 3) is the growth of the deviance for each metre or degree squared.
     """
     needed = np.sqrt(COSTS[fault] + least_gain(arrays)) + SURELY
     values, vectors = np.linalg.eigh(seen)

@@ -1,4 +1,7 @@
-"""Finds faults of single channels in their samples, with or without sounds: clipping, a constant, hum, noise."""
+"""Finds faults of single channels in their samples, with or without sounds: clipping, a constant, hum, noise.
+
+`findings` finds dead, deaf, copied and inverted channels by the sounds that arrays received.
+"""
 
 from __future__ import annotations
 
@@ -17,20 +20,20 @@ CLIPPED: Final = 0.995
 """Magnitude at and above which a sample counts as clipped if its neighbour does too; full scale is 1."""
 
 MOST_CLIPPED: Final = 20
-"""Clipped samples that are not told yet."""
+"""Greatest number of clipped samples that is not reported."""
 
 MOST_CONSTANT: Final = 0.01
-"""Magnitude of a channel's mean that is not told yet, full scale 1."""
+"""Greatest magnitude of a channel's mean, full scale 1, that is not reported."""
 
 MAINS_HZ: Final = (50.0, 60.0)
 HARMONICS: Final = 6
-"""Harmonics of the mains that are looked at."""
+"""Number of harmonics of the mains that are examined."""
 
 MOST_WINDOWS: Final = 120
-"""Windows, the last ones, in which hum is looked for."""
+"""Number of windows, the latest, in which hum is looked for."""
 
 LEAST_LINES: Final = 2
-"""Fewest of these that are hum without the first: a single one may be any tone."""
+"""Fewest harmonics that count as hum if the first one is missing: a single one may be any tone."""
 
 HUM_DB: Final = 15.0
 """Height, in decibels, of a line over the spectrum beside it, from which it is hum."""
@@ -39,7 +42,7 @@ HUM_DBFS: Final = -70.0
 """Least level of the lines together, dB re full scale."""
 
 NOISY_DB: Final = 10.0
-"""Level of a channel's noise over its neighbours', in decibels, from which it is told."""
+"""Level of a channel's noise above that of its neighbours, in decibels, from which it is reported."""
 
 CLIPPING_CURE: Final = "lower the gain of this input"
 

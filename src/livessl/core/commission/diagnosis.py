@@ -43,7 +43,7 @@ FLOOR_S: Final = 12e-6
 to 2 cm and 1.5 degrees."""
 
 MOST_SOUNDS: Final = 24
-"""Most sounds that are compared: more of them tell little more, because the errors of the set-up do not average out."""
+"""Most sounds that are compared: more of them show little more, because the errors of the set-up do not average out."""
 
 MOST_ARRAYS: Final = 8
 """Most arrays that are judged together. The time of each fit grows with the cube of their number, its memory with the
@@ -126,7 +126,7 @@ def diagnose(
 def verify(microphones: Microphones, delays: Delays, places_m: FloatArray, c_m_s: float) -> Diagnosis:
     """Compare the set-up as filed with its alternatives, by sounds at places that somebody measured.
 
-    One array is enough, and one sound shows whether something is wrong; three or four tell what.
+    One array is enough, and one sound shows whether something is wrong; three or four show what.
 
     Parameters
     ----------

@@ -36,8 +36,8 @@ UPRIGHT_COST: Final = 2.0
 """Deviance that a turn about the vertical alone must gain: it has one unknown, and is what people get wrong."""
 
 FREER_COST: Final = 8.0
-"""Deviance that a set-up must gain in which the pose or all microphones of an array are free: as much as a fault of
-three unknowns must. The faults of one unknown that it covers are larger where they are told."""
+"""Deviance that a set-up must gain if the pose or all microphones of an array are free in it: as much as a fault of
+three unknowns must. The faults of one unknown that it covers gain more where they are reported."""
 
 FREE_M: Final = 1.0
 FREE_DEG: Final = 60.0

@@ -2,7 +2,8 @@
 
 Arrays that are reflected in a plane, and with them all sounds, receive the same. If the centres of all arrays lie in
 the plane and the reflection of each is nearly the array itself with its channels in another order, a set-up as filed
-cannot be told from one whose channels are exchanged at each array: every place is then on the wrong side of the plane.
+cannot be distinguished from one whose channels are exchanged at each array: every place is then on the wrong side of
+the plane.
 """
 
 from __future__ import annotations
@@ -52,8 +53,8 @@ def mirrored(microphones: Microphones, places_m: FloatArray, bounds_m: FloatArra
     -------
     BlindSpot or None
         Of the reflection that needs the smallest turns: the arrays whose channels it exchanges, the largest of the
-        turns as `least`, and the normal of the plane as `along`. None with an array on one line, which no reflection
-        tells from a turn, and where no array needs exchanged channels: then the geometry shows it before any sound.
+        turns as `least`, and the normal of the plane as `along`. None if an array lies on one line, because its
+        reflection is a turn, and if no array needs exchanged channels: then the geometry shows it before any sound.
     """
     if any(_is_line(at_m) for at_m in microphones.values()):
         return None
@@ -81,7 +82,7 @@ def _is_line(at_m: FloatArray) -> bool:
 
 
 def _are_inside(places_m: FloatArray, middle_m: FloatArray, normals: FloatArray, bounds_m: FloatArray) -> BoolArray:
-    """Whether all places (S, 3) are inside the search volume when they are mirrored in each plane."""
+    """Return for each plane whether all places (S, 3), mirrored in it, are inside the search volume."""
     heights_m = (places_m - middle_m) @ normals.T
     mirrored_m = places_m[:, None] - 2.0 * heights_m[..., None] * normals
     beyond_m = np.maximum(bounds_m[:, 0] - mirrored_m, mirrored_m - bounds_m[:, 1])

@@ -87,7 +87,7 @@ def careful(
 
 @dataclass(frozen=True, slots=True)
 class Known:
-    """How exactly a set-up and the delays of some sounds in it are known.
+    """The accuracy with which a set-up, and the delays of some sounds in it, are known.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What the frames before a sound say about the frames of it. It sees how loud frames were, and their correlations.
+"""Estimates the background of a sound from the frames before it. It sees the power of frames, and their correlations.
 
 What a background adds to the evidence is known from the pre-roll. Where it is not far below the sound, frames that are
 much weaker than the loudest are mostly background, but their onsets count as much as those of loud frames.

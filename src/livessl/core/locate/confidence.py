@@ -155,12 +155,12 @@ class ConfidenceFeatures:
 
     @property
     def weakness(self) -> float:
-        """How much the second array falls short of a clear peak, where its line of sight determines the distance."""
+        """Shortfall of the second array from a clear peak if its line of sight determines the distance; 0 otherwise."""
         return max(0.0, CLEAR_PEAK_TO_RMS - self.second_array) if self.crossing_deg >= CROSSING_DEG else 0.0
 
     @property
     def lacking(self) -> float:
-        """How much of the peak is missing where the sound begins, 0 to 1; 0 if the beginning is not known."""
+        """Share of the peak that is missing where the sound begins, 0 to 1; 0 if the beginning is not known."""
         if self.beginning is None or self.peak_to_rms <= 0.0:
             return 0.0
         return max(0.0, 1.0 - self.beginning / (_BEGUN * self.peak_to_rms))

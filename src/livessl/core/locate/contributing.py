@@ -17,8 +17,8 @@ array cannot move it any more. It then has to exceed only what noise reaches at 
 reverberant room rarely stand out one by one; those that do are often those that a reflection dominates.
 
 An array that detected a sound by itself received something. If its onsets are faint (`FAINT`), it contributes although
-nothing stands out: with the others it may still tell the distance. If they are strong, they must stand out: a strong
-sound that comes from nowhere is wind, a touch, or a crackle of the electronics.
+nothing stands out: with the others it may still determine the distance. If they are strong, they must stand out: a
+strong sound that comes from nowhere is wind, a touch, or a crackle of the electronics.
 """
 
 from __future__ import annotations

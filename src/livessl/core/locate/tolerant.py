@@ -5,7 +5,7 @@ Where an array's channels come from several recorders, their clocks may be apart
 and the sum of sharp peaks may be highest where some of them meet by chance. Averaged over the delays that the clocks
 allow, the GCC of a pair is its convolution with their distribution, and peaks that the clocks have moved meet again.
 
-What this costs is resolution, so the sharp evidence tells the place wherever both agree.
+What this costs is resolution, so the sharp evidence determines the place wherever both agree.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """Faults of channels that show in the sound: channels that are copies of others, and inverted ones.
 
 An array with such a fault gives wrong directions with great confidence, so its sound is not used. This module sees
-samples and correlations, and locates nothing.
+samples and correlations, and locates nothing. `array_health` finds dead and weak channels, and
+`livessl.core.commission` finds swapped ones.
 
 - *Copies.* Two microphones have noise of their own; in quiet frames they are never the same signal, whatever the sound
   field. Two channels are copies if they are the same up to a factor: first in their differences from sample to sample,
@@ -9,7 +10,7 @@ samples and correlations, and locates nothing.
 - *Two arrays on the same channels.* The first samples of each channel are looked up among those of all other arrays at
   that frame index, so that the cost of a frame does not grow with the number of arrays.
 - *Inverted channels.* The GCC of a pair has its extreme where the direct sound is; it is negative if one of the two
-  channels is inverted. If the signs of the pairs are clear and fit, they tell which channels differ from the others.
+  channels is inverted. If the signs of the pairs are clear and fit, they show which channels differ from the others.
 """
 
 from __future__ import annotations

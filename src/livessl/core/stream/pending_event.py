@@ -1,11 +1,11 @@
 """The life of an event, from its first active frame until it has been reported. It locates nothing.
 
-| state | entered when | left for |
+| state | entered when | next state |
 |---|---|---|
 | `OPEN` | a frame index with an active frame closes | `ENDED`; `REPORTED` if it is cut short |
 | `ENDED` | the sound was quiet for a hang-over, or has reached the greatest length | `AWAITING_BACKFILL`, `REPORTED` |
 | `AWAITING_BACKFILL` | frames were requested from arrays that did not detect the sound | `REPORTED` |
-| `REPORTED` | its results were handed over, or another pass reports it | |
+| `REPORTED` | its results were handed over, or are left to another pass | none |
 
 An event is cut short if no more frames come: at the end of a recording, before a gap, when all arrays are silent, and
 when the server's clock is set back.
@@ -53,7 +53,7 @@ class RequestedFrames:
 
     @property
     def is_complete(self) -> bool:
-        """True once all have come; frames come in order."""
+        """True once the last one has come, and with it all, because frames come in order."""
         return self.span[-1] in self.frames
 
 
@@ -76,9 +76,9 @@ class PendingEvent:
         """True if it ended with a quiet hang-over, not by its length."""
         self.late_frames = 0
         self.excerpt: Excerpt | None = None
-        """Sound that it was located from; None until it is located, and if another pass reports it."""
+        """Sound from which it was located; None before it is located, and if another pass reports it."""
         self.results: Sequence[Event] = ()
-        """Its results, one for each source; empty until it is located, and if another pass reports it."""
+        """Its results, one for each source; empty before it is located, and if another pass reports it."""
         self.requested: Mapping[str, RequestedFrames] = {}
         self.requested_ns = 0
 
@@ -117,12 +117,12 @@ class PendingEvent:
         self.results, self.excerpt = results, excerpt
 
     def await_backfill(self, requested: Mapping[str, RequestedFrames], now_ns: int) -> None:
-        """Wait for frames that were requested now."""
+        """Begin to wait for frames that were requested at `now_ns`."""
         self._go_to(EventState.AWAITING_BACKFILL)
         self.requested, self.requested_ns = requested, now_ns
 
     def report(self) -> None:
-        """End its life."""
+        """Mark the event as reported."""
         self._go_to(EventState.REPORTED)
 
     def _go_to(self, state: EventState) -> None:

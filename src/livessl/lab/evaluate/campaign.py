@@ -22,10 +22,10 @@ from livessl.lab.evaluate.parquet import write_smallest
 from livessl.workers import on_cores
 
 REPORT_FILES: Final = ("report.md", "summary.csv", "claims.md", "claims.csv", "figures")
-"""What a report writes into a folder."""
+"""Files and folders that a report writes."""
 
 FILES: Final = ("results.parquet", "parts", "cost.jsonl", *REPORT_FILES)
-"""What a campaign and its report write into a folder, besides `campaign.json`."""
+"""Files and folders that a campaign and its report write, besides `campaign.json`."""
 
 
 @dataclass(frozen=True, slots=True)

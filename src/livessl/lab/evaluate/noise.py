@@ -54,11 +54,11 @@ WALL_M: Final = 0.2
 """Least distance, in metres, of a source from the walls."""
 
 WHERE: Final[Mapping[str, tuple[float, float]]] = {"inside": (0.0, 0.7), "edge": (0.7, 1.2), "outside": (1.2, np.inf)}
-"""Where a source is in plan: ranges of its distance from the middle of the arrays, relative to that of the array which
+"""Places of a source in plan: ranges of its distance from the middle of the arrays, relative to that of the array which
 is furthest from there."""
 
 FACING: Final = ("all around", "towards", "away")
-"""How a source radiates: alike in all directions, or as a talker who faces the nearest array, or turns away from it."""
+"""Radiation of a source: alike in all directions, or as a talker who faces the nearest array, or turns away from it."""
 
 OTHER_NOISE: Final = ("diffuse", 20.0)
 """Kind and level, in dB, of the noise with which the sounds of `OTHER_SOUNDS` are played."""

@@ -25,7 +25,8 @@ MAX_ALERTS: Final = 100_000
 """Most alerts that are kept, about 200 MB; the oldest are deleted first, delivered or not."""
 
 MAX_WAITING: Final = 1000
-"""Most alerts that wait for one action. Beyond it a new one is a dead letter at once: the action is beyond hope."""
+"""Most alerts that wait for one action. Beyond it a new one is a dead letter at once: so many waiting ones mean
+that the action does not work."""
 
 BUSY_S: Final = 1.0
 """Longest wait, in seconds, for a file that another program has locked."""

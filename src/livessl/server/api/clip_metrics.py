@@ -31,5 +31,7 @@ def clip_metrics(parts: Parts) -> Iterator[Metric]:
         results.add_metric([result], count)
     yield results
     yield CounterMetricFamily(
-        "livessl_clips_frames_dropped", "Frames that no recording can have, for want of memory.", clips.frames_dropped
+        "livessl_clips_frames_dropped",
+        "Frames that no recording can contain because memory was full.",
+        clips.frames_dropped,
     )

@@ -48,13 +48,13 @@ class ClipsState(BaseModel):
         ge=0, description="Events with recordings that could not be read when they were last needed."
     )
     waiting: int = Field(ge=0, description="Events whose recordings are being made.")
-    frames_dropped: int = Field(ge=0, description="Frames that no recording can have, for want of memory.")
+    frames_dropped: int = Field(ge=0, description="Frames that no recording can contain because memory was full.")
     written: int = Field(ge=0, description="Events whose recordings were stored.")
     incomplete: int = Field(ge=0, description="Of those, events of which frames of an array are missing.")
     without_sound: int = Field(ge=0, description="Events of which no frame was left.")
-    shed: int = Field(ge=0, description="Events without recordings because too many waited, or for the load.")
+    shed: int = Field(ge=0, description="Events without recordings because too many waited, or because of overload.")
     failed: int = Field(ge=0, description="Events without recordings because of an error.")
-    deleted: int = Field(ge=0, description="Events whose recordings were deleted for their age or for room.")
+    deleted: int = Field(ge=0, description="Events whose recordings were deleted because of age or lack of space.")
 
 
 class KeepSwitch(BaseModel):

@@ -33,7 +33,7 @@ class Stages:
     sent : float
         Time until the node had sent the last message that the answer needs, by the node's clock.
     received : float
-        Time until the server had received that message; compares two clocks unless both are on one machine.
+        Time until the server had received that message; the difference of two clocks unless both are on one machine.
     located : float
         Time until the answer was computed, by the server's clock.
     """
@@ -45,7 +45,7 @@ class Stages:
 
     @property
     def ours(self) -> float:
-        """Time from the last moment that the answer depends on to the answer, in seconds."""
+        """Time, in seconds, that livessl itself takes: all stages but the wait for quiet."""
         return self.sent + self.received + self.located
 
     @property
@@ -63,7 +63,7 @@ class Messages:
     origin_ns : int
         Site time at which `start_s` is 0: the beginning of the recording or of the live run, in nanoseconds.
     utc : bool
-        Whether site time is UTC. If a recording does not say when it was made, it is not, and `time_utc` is null.
+        Whether site time is UTC. It is not if a recording does not say when it was made; `time_utc` is null then.
     zones : callable or None
         Returns the zones that are in force; None for those of the site.
     """
@@ -74,7 +74,7 @@ class Messages:
         self._utc = utc
 
     def event(self, event: Event, stages: Stages | None = None, replaces: Sequence[str] = ()) -> JsonObject:
-        """Encode an event, with the ids of the early ones that it replaces; the fields of the contract come first."""
+        """Encode an event, with the ids of the early ones that it replaces."""
         position, covariance, confidence, arrays = where(event.estimate)
         zones = self._zones()
         holding = zones.holding(position)
@@ -171,7 +171,7 @@ def where(
 
 
 def answer(event: Event) -> JsonObject:
-    """Where an event was, by which method, and how sure: the `LocationAnswer` of `livessl.schema.relocation`."""
+    """Encode where an event was located, and how, as a `LocationAnswer` of `livessl.schema.relocation`."""
     position, covariance, confidence, arrays = where(event.estimate)
     return {
         "method": event.method,

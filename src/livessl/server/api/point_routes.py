@@ -28,7 +28,7 @@ _NO_PLACE: Final = "The event was not located."
 
 
 class Pointing(BaseModel):
-    """How to turn a camera towards a place."""
+    """The direction in which a camera has to be turned towards a place."""
 
     v: Version
     camera: str = Field(description="Name of the camera in the site file.", examples=["door"])

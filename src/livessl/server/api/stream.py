@@ -17,8 +17,8 @@ from livessl.server.parts import Parts
 STREAM: Final = "/api/v1/stream"
 
 HEARTBEAT_S: Final = 10.0
-"""Longest silence in seconds. A heartbeat lets proxies and clients tell a quiet site from a dead connection, and tells
-a client whose filter admits little how far the numbers have come."""
+"""Longest silence in seconds. A heartbeat lets proxies and clients distinguish a quiet site from a dead connection.
+It also gives the latest number to a client whose filter admits little."""
 
 RETRY_MS: Final = 1000
 """Wait, in milliseconds, after which a browser connects again."""

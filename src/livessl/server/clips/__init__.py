@@ -1,7 +1,8 @@
 """The sound of events: the arrays' recordings around them, and the beam at their place.
 
 `ring` holds the newest frames, `cut` makes one recording of them, `record` writes it, and `service` is the thread that
-does so. The beam itself is computed by `livessl.core.enhance`; nothing here locates anything.
+does so and decides how long clips are kept. `folder` stores and deletes them. `livessl.core.enhance` computes the beam,
+and `relocate` locates an event again from its recordings.
 """
 
 from __future__ import annotations

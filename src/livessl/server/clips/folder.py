@@ -1,4 +1,4 @@
-"""The folder of clips: for each event a folder with its recordings and one JSON file about them.
+"""Stores and deletes clips, each a folder of recordings with one JSON file; `service` sets the limits of age and bytes.
 
 A clip is written into a folder of another name first, so that a killed server leaves no half of one.
 """
@@ -37,7 +37,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class _Entry:
-    """The properties of a clip that retention needs; `keep` is None while nobody can know it."""
+    """The properties of a clip that decide its retention; `keep` is None while it is unknown."""
 
     start_ns: int
     nbytes: int
@@ -45,7 +45,7 @@ class _Entry:
 
     @property
     def stays(self) -> bool:
-        """Whether neither age nor room deletes the clip; one that may be kept for ever is treated as if it were."""
+        """True if the clip is deleted neither by age nor for space: it is kept for ever, or may be."""
         return self.keep is not False
 
 

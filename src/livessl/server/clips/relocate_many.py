@@ -21,12 +21,12 @@ from livessl.workers import on_cores
 
 @dataclass(frozen=True)
 class Task:
-    """What all events are located again with.
+    """The settings with which all events are located again.
 
     Parameters
     ----------
     site : Site
-        With the poses of now.
+        Has the poses that are in force now.
     folder : Path
         The clips.
     method : str or None

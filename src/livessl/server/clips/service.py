@@ -54,7 +54,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class _Ahead:
-    """How far an array's clock is ahead, and the whole frames of that by which the fusion corrects frame indices."""
+    """The time by which an array's clock is ahead, and the whole frames of it by which the fusion corrects indices."""
 
     ns: int
     frames: int
@@ -84,7 +84,7 @@ class Counts:
     failed: int = 0
     """Events without a clip because of an error."""
     deleted: int = 0
-    """Clips that were deleted for their age or for room."""
+    """Clips that were deleted because of age or lack of space."""
 
 
 class Clips:
@@ -101,7 +101,7 @@ class Clips:
     site_time : SiteTime
         Knows whether a replay runs; its events get no clips.
     overload : Overload
-        No clip is cut while whole arrays are given up for the load: their frames have no samples then.
+        No clip is cut while an overload leaves out whole arrays: their frames have no samples then.
 
     Raises
     ------
@@ -132,7 +132,7 @@ class Clips:
         """The error that has ended the thread, if one has."""
 
     def prepare(self, site: Site) -> Callable[[], None]:
-        """Return what takes the arrays to be where this site has them, from the next clip on; on any thread."""
+        """Return a function that makes the next clips use the arrays of this site; any thread may call this."""
         specs = {spec.name: spec for spec in site.processed}
 
         def take_over() -> None:
