@@ -2,7 +2,7 @@
 # Installs livessl with everything that its tests need, then runs every check: sh scripts/test.sh [OPTIONS of pytest]
 set -eu
 cd "$(dirname "$0")/.."
-packages="chromium mosquitto nats-server nginx-light prometheus libportaudio2 pulseaudio pulseaudio-utils libasound2-plugins systemd openssl
+packages="chromium-headless-shell mosquitto nats-server nginx-light prometheus libportaudio2 pulseaudio pulseaudio-utils libasound2-plugins systemd openssl
 postgresql gcc libc6-dev libasound2-dev"
 command -v npm >/dev/null || packages="$packages nodejs npm" # where it is not from elsewhere already
 
@@ -24,7 +24,7 @@ install_missing() {
     echo "test: installing$missing" >&2
     # shellcheck disable=SC2086  # $missing is a list of words
     if ! { apt_get update && apt_get install -y --no-install-recommends $missing; }; then
-        echo "test: installation failed. Tests that need a missing package are skipped: the dashboard in a browser (chromium)," >&2
+        echo "test: installation failed. Tests that need a missing package are skipped: the dashboard in a browser (chromium-headless-shell)," >&2
         echo "test: the units in deploy/ (systemd), TLS (openssl), reverse proxies (nginx-light), MQTT (mosquitto), hubs (nats-server), PostgreSQL (postgresql), metrics (prometheus), TypeScript clients (npm)," >&2
         echo "test: a sound card (the others). To run them, first:" >&2
         echo "test: sudo apt-get install$missing" >&2

@@ -24,7 +24,7 @@ from playwright.sync_api import ConsoleMessage, Page, sync_playwright
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
-from browser import INTERFACES_CHANGED, visit
+from browser import INTERFACES_CHANGED, browser_program, visit
 from conftest import require
 from livessl.clock import utc_text
 from livessl.lab import demo
@@ -33,7 +33,6 @@ from small_site import HANG_S, wait_until
 
 ROOT = Path(__file__).parents[1]
 LIVESSL = [sys.executable, "-m", "livessl"]
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 QUIET_BROWSER = [
     "--no-sandbox",
     "--disable-gpu",
@@ -129,7 +128,7 @@ def located(session: Session) -> str:
 @pytest.fixture(scope="module")
 def live(session: Session) -> LiveRun:
     """Run a server, two nodes, a subscriber, the documented clients and a browser while the session plays once."""
-    require(CHROMIUM is not None, "Chromium is not installed (Debian: apt install chromium)")
+    program = browser_program()
     seen = LiveRun()
     server = subprocess.Popen([*LIVESSL, "serve", "--site", str(session.site)])
     nodes: list[subprocess.Popen[bytes]] = []
@@ -166,7 +165,7 @@ def live(session: Session) -> LiveRun:
 def browser_page(session: Session, seen: LiveRun) -> Iterator[Page]:
     """The dashboard in a browser, with the documented JavaScript client in it."""
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=QUIET_BROWSER)
+        browser = playwright.chromium.launch(executable_path=program, args=QUIET_BROWSER)
         page = browser.new_page(viewport={"width": 1440, "height": 900})
         page.on("console", seen.note_error)
         page.on("pageerror", lambda error: seen.problems.append(str(error)))
