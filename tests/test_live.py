@@ -128,7 +128,7 @@ def located(session: Session) -> str:
 @pytest.fixture(scope="module")
 def live(session: Session) -> LiveRun:
     """Run a server, two nodes, a subscriber, the documented clients and a browser while the session plays once."""
-    program = browser_program()
+    browser_program()
     seen = LiveRun()
     server = subprocess.Popen([*LIVESSL, "serve", "--site", str(session.site)])
     nodes: list[subprocess.Popen[bytes]] = []
@@ -165,7 +165,7 @@ def live(session: Session) -> LiveRun:
 def browser_page(session: Session, seen: LiveRun) -> Iterator[Page]:
     """The dashboard in a browser, with the documented JavaScript client in it."""
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=program, args=QUIET_BROWSER)
+        browser = playwright.chromium.launch(executable_path=browser_program(), args=QUIET_BROWSER)
         page = browser.new_page(viewport={"width": 1440, "height": 900})
         page.on("console", seen.note_error)
         page.on("pageerror", lambda error: seen.problems.append(str(error)))
