@@ -1,7 +1,7 @@
 """Holds every message and every answer of the servers and hubs that tests run against the models of the API.
 
-A plugin of pytest: it watches each application that a `Server` or a `HubServer` makes. What breaks the contract makes the test that ran
-at that moment fail.
+A plugin of pytest: it watches each application that a `Server` or a `HubServer` makes. What breaks the contract makes
+the test that ran at that moment fail.
 """
 
 from __future__ import annotations

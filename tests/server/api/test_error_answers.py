@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import httpx
@@ -13,7 +12,6 @@ from hub_desk import make_hub, running_hub
 from livessl.schema.answers import Error, HTTPValidationError
 from small_site import running_server, site_of
 
-PLACES = {"query": "params", "header": "headers"}
 NO_TEXT = b"\x11\xff"
 NOBODY = "nats://127.0.0.1:1"
 
@@ -68,7 +66,7 @@ def hub_url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 
 def bad_requests(method: str, address: str, operation: dict[str, Any]) -> Iterator[httpx.Request]:
-    """Requests to an operation, each with one bad value: an unknown parameter, each parameter that can be bad, a body."""
+    """Requests to an operation, each with one bad value: an unknown parameter, each known one, a body."""
     parameters = operation.get("parameters", [])
     names = {each["name"]: "1" for each in parameters if each["in"] == "path"}
     usual = address.format(**names)
@@ -80,8 +78,10 @@ def bad_requests(method: str, address: str, operation: dict[str, Any]) -> Iterat
             continue
         if each["in"] == "path":
             yield httpx.Request(method, address.format(**{**names, name: "bad"}))
+        elif each["in"] == "query":
+            yield httpx.Request(method, usual, params={name: "bad"})
         else:
-            yield httpx.Request(method, usual, **{PLACES[each["in"]]: {name: "bad"}})
+            yield httpx.Request(method, usual, headers={name: "bad"})
     for content in (b'{"no_such": 1}', b"[]", b"{", NO_TEXT) if "requestBody" in operation else ():
         yield httpx.Request(method, usual, content=content, headers={"Content-Type": "application/json"})
 
