@@ -1,7 +1,7 @@
-"""Holds every message and every answer of the servers that tests run against the models of the API.
+"""Holds every message and every answer of the servers and hubs that tests run against the models of the API.
 
-A plugin of pytest: it watches each application that a `Server` makes. What breaks the contract makes the test that ran
-at that moment fail.
+A plugin of pytest: it watches each application that a `Server` or a `HubServer` makes. What breaks the contract makes
+the test that ran at that moment fail.
 """
 
 from __future__ import annotations
@@ -18,6 +18,10 @@ from pydantic import TypeAdapter, ValidationError
 from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.types import Message as Sent
 
+from livessl.federation.app import create_hub_app
+from livessl.federation.archive import Archive
+from livessl.federation.config import Hub
+from livessl.federation.intake import Intake
 from livessl.schema.answers import Error, HTTPValidationError
 from livessl.schema.messages import Message
 from livessl.server.api.app import create_app
@@ -25,6 +29,7 @@ from livessl.server.api.auth import Access
 from livessl.server.api.live import LIVE
 from livessl.server.fanout import Fanout
 from livessl.server.parts import Parts
+from livessl.server.refusals import Refusals
 
 UNMODELLED: Final = ("/api/v1/openapi.json", "/api/v1/asyncapi.json")
 """JSON whose form others define."""
@@ -37,7 +42,7 @@ class Contract:
         self.faults: list[str] = []
         self.messages = 0
         self.answers = 0
-        self.paths: dict[str, Any] = {}
+        self.paths: dict[str, dict[str, Any]] = {}
 
     def take(self) -> list[str]:
         """The faults since the last call."""
@@ -66,8 +71,8 @@ class Contract:
         self.messages += 1
         self.check(Message, text, "message")
 
-    def check_answer(self, scope: Scope, status: int, headers: dict[bytes, bytes], body: bytes) -> None:
-        """Check a REST answer against what its route and the OpenAPI description declare."""
+    def check_answer(self, kind: str, scope: Scope, status: int, headers: dict[bytes, bytes], body: bytes) -> None:
+        """Check a REST answer of a kind of application against what its route and the OpenAPI description declare."""
         path, route = scope["path"].removeprefix(scope["root_path"]), scope.get("route")
         if not path.startswith("/api/") or path in UNMODELLED:
             return
@@ -77,7 +82,10 @@ class Contract:
         model = HTTPValidationError if status == 422 else Error
         if route is not None and status != 405:
             method = scope["method"].replace("HEAD", "GET").lower()
-            described = self.paths[route.path][method]["responses"]
+            operation = self.paths[kind][route.path][method]
+            described = operation["responses"]
+            if status == 422:
+                self.faults += [f"{what}: {fault}" for fault in misplaced(operation, orjson.loads(body or b"{}"))]
             if str(status) not in described or form not in described[str(status)].get("content", [""]):
                 self.faults.append(f"{what}: status {status} with content {form!r} is not described")
             model = route.response_model if status == 200 else route.responses.get(status, {}).get("model", model)
@@ -98,6 +106,15 @@ class Contract:
 CONTRACT: Final = Contract()
 
 
+def misplaced(operation: dict[str, Any], refusal: dict[str, Any]) -> list[str]:
+    """Faults of a 422 whose `loc` names nothing of the request: no parameter, or a body that there is not."""
+    known = {(each["in"], each["name"]) for each in operation.get("parameters", [])}
+    places = [tuple(fault["loc"]) for fault in refusal.get("detail", []) if fault["type"] != "extra_forbidden"]
+    if "requestBody" in operation:
+        places = [place for place in places if place[0] != "body"]
+    return [f"{place} is nothing of the request" for place in places if place[:2] not in known]
+
+
 @cache
 def _adapter(model: Any) -> TypeAdapter[Any]:
     return TypeAdapter(model)
@@ -106,8 +123,9 @@ def _adapter(model: Any) -> TypeAdapter[Any]:
 class Checked:
     """ASGI middleware that checks what leaves the application."""
 
-    def __init__(self, app: ASGIApp) -> None:
+    def __init__(self, app: ASGIApp, kind: str) -> None:
         self._app = app
+        self._kind = kind
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Handle one connection of the ASGI interface."""
@@ -122,7 +140,7 @@ class Checked:
             elif message["type"] == "http.response.body":
                 body.extend(message.get("body", b""))
                 if not message.get("more_body"):
-                    CONTRACT.check_answer(scope, started["status"], dict(started["headers"]), bytes(body))
+                    CONTRACT.check_answer(self._kind, scope, started["status"], dict(started["headers"]), bytes(body))
             await send(message)
 
         try:
@@ -137,15 +155,21 @@ def pytest_configure(config: pytest.Config) -> None:
     monkey = pytest.MonkeyPatch()
     config.add_cleanup(monkey.undo)
 
-    def watched(parts: Parts, access: Access) -> FastAPI:
-        application = create_app(parts, access)
-        application.add_middleware(Checked)
-        if access.wanted or not CONTRACT.paths:  # with tokens, more statuses are described
-            CONTRACT.paths = application.openapi()["paths"]
-        CONTRACT.watch(parts.fanout)
+    def check_answers(kind: str, application: FastAPI, access: Access) -> FastAPI:
+        application.add_middleware(Checked, kind=kind)
+        if access.wanted or kind not in CONTRACT.paths:  # with tokens, more statuses are described
+            CONTRACT.paths[kind] = application.openapi()["paths"]
         return application
 
+    def watched(parts: Parts, access: Access) -> FastAPI:
+        CONTRACT.watch(parts.fanout)
+        return check_answers("server", create_app(parts, access), access)
+
+    def watched_hub(hub: Hub, archive: Archive, intake: Intake, access: Access, refusals: Refusals) -> FastAPI:
+        return check_answers("hub", create_hub_app(hub, archive, intake, access, refusals), access)
+
     monkey.setattr("livessl.server.app.create_app", watched)
+    monkey.setattr("livessl.federation.app.create_hub_app", watched_hub)
 
 
 @pytest.fixture(autouse=True)

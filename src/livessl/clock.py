@@ -125,6 +125,11 @@ def utc_ns(text: str) -> int:
         instant = None
     if instant is None or instant.tzinfo is None:
         raise ValueError(f"time: expected RFC 3339 with an offset such as 2026-01-31T12:00:00Z, got {text!r}")
+    return instant_ns(instant)
+
+
+def instant_ns(instant: datetime) -> int:
+    """Return the nanoseconds since the epoch of an instant that has an offset from UTC."""
     return (instant - _EPOCH) // timedelta(microseconds=1) * 1000
 
 

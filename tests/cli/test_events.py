@@ -32,14 +32,14 @@ def test_events_are_printed_in_order_of_time(run: Run, server: Server) -> None:
     assert done.code == 0
     assert [event["id"] for event in done.objects] == ["old-0", "old-1", "old-2"]
     assert done.objects[0] == json.loads(done.out.splitlines()[0])
-    assert done.objects[0].items() >= {"position_m": [2.0, 2.0, 1.0], "time_utc": "2026-01-01T00:00:00Z"}.items()
+    assert done.objects[0].items() >= {"position_m": [2.0, 2.0, 1.0], "time_utc": "2026-01-01T00:00:00.000000Z"}.items()
 
 
 def test_filters_are_sent_to_the_server(run: Run, server: Server) -> None:
     done = run("events", "--url", server.url, "--since", SINCE, "--limit", "1", "--zone", "door")
     assert done.code == 0
     [line] = done.out.splitlines()
-    assert line.startswith("2026-01-01T00:00:00Z")
+    assert line.startswith("2026-01-01T00:00:00.000000Z")
     assert "( 2.00,  2.00,  1.00)" in line
     assert "located" in line
 

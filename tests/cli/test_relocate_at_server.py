@@ -28,6 +28,7 @@ class Scripted:
         self.busy = 0
         self.digests: Callable[[str], str | None] = lambda _: "0" * 16
         self.is_old = False
+        self.deleted: str | None = None
 
     def ask_for(self, model: Any, url: str, path: str, token_file: Path | None) -> Any:
         self.asked.append(path)
@@ -38,6 +39,8 @@ class Scripted:
             "clips": {"event_id": "any", "state": "stored", "keep": False, "position_m": None, "files": [],
                       "methods": []},
         }  # fmt: skip
+        if path == f"events/{self.deleted}/clips":
+            raise RefusedError("not found", 404, f"no event {self.deleted!r}")
         kind = path.partition("?")[0] if "?" in path else path.rpartition("/")[2]
         if self.is_old and kind == "relocation-settings":
             raise RefusedError("not found", 404, "Not Found")
@@ -69,6 +72,7 @@ def test_busy_server_is_asked_again(server: Scripted, capsys: pytest.CaptureFixt
     told = capsys.readouterr()
     found = [json.loads(line) for line in told.out.splitlines()]
     assert [(each["event_id"], each["error"]) for each in found] == [(name, None) for name in server.event_ids]
+    assert {each["time_utc"] for each in found} == {"2026-01-01T00:00:00.000000Z"}
     assert [path for path in server.asked if path.endswith("/relocate")][: times + 1] == ["events/a-1/relocate"] * (
         times + 1
     )
@@ -119,6 +123,16 @@ def test_settings_that_change_meanwhile_end_the_command(
     assert main(["relocate", "--url", URL, "--out", str(out)]) == 2
     assert "have changed meanwhile; start again, with another --out" in capsys.readouterr().err
     assert [json.loads(line)["event_id"] for line in out.read_text().splitlines()] == ["a-1"]
+
+
+def test_event_that_is_deleted_after_it_was_listed_is_left_out(
+    server: Scripted, capsys: pytest.CaptureFixture[str]
+) -> None:
+    server.deleted = "a-2"
+    assert main(["relocate", "--url", URL, "--json"]) == 0
+    told = capsys.readouterr()
+    assert [json.loads(line)["event_id"] for line in told.out.splitlines()] == ["a-1", "a-3"]
+    assert "1 of 3 located events have no recordings and are left out" in told.err
 
 
 @pytest.mark.parametrize("is_without_route", [True, False])

@@ -225,6 +225,20 @@ def test_a_message_that_cannot_be_stored_holds_up_no_other(archive: Archive, bod
         assert "\0" in str(body["id"])
 
 
+@pytest.mark.parametrize(
+    ("given", "shown"),
+    [
+        ("2026-01-01T00:00:00Z", "2026-01-01T00:00:00.000000Z"),
+        ("2026-01-01T01:00:00.5+01:00", "2026-01-01T00:00:00.500000Z"),
+    ],
+)
+def test_times_are_stored_as_servers_write_them(archive: Archive, given: str, shown: str) -> None:
+    archive.take([delivery(1, {**event(1), "time_utc": given})], PATIENCE_S)
+    found = archive.event("lab", "lab-1")
+    assert found is not None
+    assert found["time_utc"] == shown
+
+
 def test_states_tracks_and_alerts_follow_the_messages(archive: Archive) -> None:
     now = utc_text(SystemClock().now_ns())
     track = {"kind": "track", "id": 7, "state": "new", "time_utc": now}

@@ -71,6 +71,11 @@ def test_event_comes_back_as_it_was(store: Store) -> None:
     assert store.find(Query()) == ([whole], None)
 
 
+def test_id_with_nul_is_that_of_no_event(store: Store) -> None:
+    """PostgreSQL's texts cannot hold NUL."""
+    assert store.get("small-\0") is None
+
+
 def test_newest_come_first(ten: Store) -> None:
     assert ids(ten) == [9, 8, 7, 6, 5, 4, 3, 2, 1, 0]
 

@@ -11,7 +11,7 @@ from urllib.parse import quote, urlencode
 
 from livessl.cli.output import complain
 from livessl.cli.server_answers import RefusedError, ask_for, order
-from livessl.clock import SystemClock, utc_ns, utc_text
+from livessl.clock import SystemClock, utc_text
 from livessl.errors import RunError, UseError
 from livessl.schema.answers import EventPage
 from livessl.schema.relocation import Relocated, RelocationSettings, unanswered
@@ -36,7 +36,10 @@ FIRST_WAIT_S: Final = 1.0
 BUSY: Final = 503
 """Status of the answers of a busy server."""
 
-OF_ONE_EVENT: Final = (404, 409)
+NOT_FOUND: Final = 404
+"""Status of the answers about what does not exist."""
+
+OF_ONE_EVENT: Final = (NOT_FOUND, 409)
 """Statuses of answers that are about one event; after others, the next event would be refused as well."""
 
 ANSWERED: Final = {"moved_arrays", "stored", "again", "other_sources", "distance_m"}
@@ -115,7 +118,12 @@ class ServerArchive:
 
     def _has_clips(self, event_id: str) -> bool:
         path = f"events/{quote(event_id)}/clips"
-        return _patiently(lambda: ask_for(EventClips, self.url, path, self.token_file)).state != "none"
+        try:
+            return _patiently(lambda: ask_for(EventClips, self.url, path, self.token_file)).state != "none"
+        except RefusedError as error:
+            if error.status != NOT_FOUND:  # the history may have deleted the event since it was listed
+                raise
+            return False
 
     def _located(self, since_ns: int | None, until_ns: int | None) -> list[str]:
         """Return the ids of all located events, newest first."""
@@ -149,7 +157,7 @@ class ServerArchive:
         event = f"events/{quote(event_id)}"
         try:
             about = _patiently(lambda: ask_for(Event, self.url, event, self.token_file))
-            found["time_utc"] = None if about.time_utc is None else utc_text(utc_ns(about.time_utc.isoformat()))
+            found |= about.model_dump(mode="json", include={"time_utc"})
             answer = _patiently(
                 lambda: order(Relocated, self.url, f"{event}/relocate", self.token_file, self._wanted, ANSWER_S)
             )

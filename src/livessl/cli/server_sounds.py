@@ -12,7 +12,7 @@ import numpy as np
 
 from livessl.calibration import HeardSound
 from livessl.cli.server_answers import ask_for
-from livessl.clock import SystemClock, utc_ns
+from livessl.clock import SystemClock, instant_ns
 from livessl.core.types import Observation
 from livessl.errors import ConfigError, RunError
 from livessl.schema import answers
@@ -115,8 +115,8 @@ class ServerSounds:
 
     def _after(self, number: int) -> Answer:
         answer = ask_for(set_up_schema.HeardSounds, self._url, f"sounds?after={number}", self._token_file)
-        sounds = [(utc_ns(one.time_utc.isoformat()), _sound(one)) for one in answer.sounds]
-        return Answer(utc_ns(answer.now_utc.isoformat()), answer.last, sounds)
+        sounds = [(instant_ns(one.time_utc), _sound(one)) for one in answer.sounds]
+        return Answer(instant_ns(answer.now_utc), answer.last, sounds)
 
     def _described(self) -> answers.Site:
         return ask_for(answers.Site, self._url, "site", self._token_file)
@@ -125,7 +125,7 @@ class ServerSounds:
 def _sound(one: set_up_schema.HeardSound) -> HeardSound:
     position_m = None if one.position_m is None else np.array(one.position_m, dtype=np.float64)
     observations = tuple(_observation(each) for each in one.observations)
-    start_s = utc_ns(one.time_utc.isoformat()) / 1e9
+    start_s = instant_ns(one.time_utc) / 1e9
     return HeardSound(start_s, position_m, str(one.status), one.reason, observations)
 
 

@@ -8,6 +8,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import TypedDict
 
+from livessl.clock import instant_ns, utc_text
 from livessl.errors import UseError
 
 
@@ -91,5 +92,5 @@ def rfc3339(time: datetime | str | None, name: str) -> str | None:
     if isinstance(time, datetime):
         if time.tzinfo is None:
             raise UseError(f"{name}: expected a time with an offset from UTC, got {time}; add tzinfo=datetime.UTC")
-        return time.isoformat()
+        return utc_text(instant_ns(time))
     return time

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from fastapi import Depends, FastAPI, Request, Response
+from fastapi.exceptions import RequestValidationError
 from fastapi.responses import FileResponse, JSONResponse
 from fastapi.staticfiles import StaticFiles
 
@@ -25,7 +26,7 @@ from livessl.server.api.app import STATIC
 from livessl.server.api.auth import Access, Gate
 from livessl.server.api.hosts import HostCheck, ServerNames
 from livessl.server.api.proxy import BehindProxy
-from livessl.server.api.queries import refuse_unknown_parameters
+from livessl.server.api.queries import refuse_request, refuse_unknown_parameters
 from livessl.server.event_retention import delete_old_events
 from livessl.server.forwarding.stream import ended
 from livessl.server.history.database import StoreError
@@ -67,6 +68,7 @@ def create_hub_app(hub: Hub, archive: Archive, intake: Intake, access: Access, r
     app.include_router(hub_routes(hub.settings.hub, archive, intake), dependencies=strict, responses=errors(422))
     app.include_router(metrics_route(archive, intake))
     app.add_exception_handler(StoreError, _without_database)
+    app.add_exception_handler(RequestValidationError, refuse_request)
 
     @app.get("/", include_in_schema=False)
     async def page() -> FileResponse:

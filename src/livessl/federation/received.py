@@ -6,16 +6,18 @@ from typing import Annotated, Any, Final
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
-from livessl.clock import utc_ns
+from livessl.clock import utc_ns, utc_text
 
 MAX_NS: Final = 2**63 - 1
 """Latest time that a database can hold, in 2262."""
 
 
 def _instant(text: str) -> str:
-    if not 0 <= utc_ns(text) <= MAX_NS:
+    """Return a time as servers write it, as which the hub passes it on."""
+    time_ns = utc_ns(text)
+    if not 0 <= time_ns <= MAX_NS:
         raise ValueError(f"time: expected one from 1970 to 2262, got {text!r}")
-    return text
+    return utc_text(time_ns)
 
 
 Instant = Annotated[str, AfterValidator(_instant)]

@@ -46,11 +46,13 @@ def _add_state(router: APIRouter, name: str, archive: Archive, intake: Intake) -
     @router.get("/api/v1/arrays", tags=["state"], response_model=schema.SiteArrays, responses=errors(503))
     def get_arrays(site: Site = None) -> Response:
         """The last change of each array's state."""
+        require_no_nul(site=site)
         return as_json({"v": API_VERSION, "arrays": archive.arrays(site)})
 
     @router.get("/api/v1/tracks", tags=["estimates"], response_model=schema.SiteTracks, responses=errors(503))
     def get_tracks(site: Site = None) -> Response:
         """The tracks that have begun and not ended, as they began."""
+        require_no_nul(site=site)
         return as_json({"v": API_VERSION, "tracks": archive.tracks(site)})
 
     @router.get(HEALTH, tags=["state"], response_model=schema.HubHealth | schema.HubHealthStatus)
@@ -136,6 +138,7 @@ def _add_alerts(router: APIRouter, archive: Archive) -> None:
         before: Annotated[int | None, Query(ge=0, lt=2**63, description="`next_before` of a page")] = None,
     ) -> Response:
         """Alerts of all sites, those that the hub received last first."""
+        require_no_nul(site=site)
         found = archive.alerts(site, limit, before)
         following = found[-1][0] if len(found) == limit else None
         return as_json({"v": API_VERSION, "alerts": [alert for _, alert in found], "next_before": following})

@@ -10,8 +10,9 @@ from __future__ import annotations
 from enum import StrEnum
 from typing import Annotated, Literal
 
-from pydantic import AwareDatetime, Field
+from pydantic import AwareDatetime, Field, PlainSerializer, WithJsonSchema
 
+from livessl.clock import instant_ns, utc_text
 from livessl.core.states import ClockState, Status, TrackState
 from livessl.schema.base import Model
 from livessl.schema.reports import Channel, DriftState, Host
@@ -28,7 +29,15 @@ Seq = Annotated[
         examples=[1767225600123],
     ),
 ]
-UtcTime = Annotated[AwareDatetime, Field(description="RFC 3339 time in UTC.", examples=["2026-01-31T12:00:00.050000Z"])]
+UtcTime = Annotated[
+    AwareDatetime,
+    PlainSerializer(
+        lambda instant: utc_text(instant_ns(instant)),
+        return_type=Annotated[str, WithJsonSchema({"type": "string", "format": "date-time"})],
+        when_used="json",
+    ),
+    Field(description="RFC 3339 time in UTC, with microseconds.", examples=["2026-01-31T12:00:00.050000Z"]),
+]
 PositionM = Annotated[
     list[float],
     Field(

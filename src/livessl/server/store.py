@@ -240,6 +240,8 @@ class Store:
 
     def get(self, event_id: str) -> JsonObject | None:
         """Return the event of that id, None if there is none."""
+        if "\0" in event_id:  # PostgreSQL cannot compare it
+            return None
         self.backlog.settle()
         with self._database.reading() as connection:
             body = connection.execute(select(events.c.body).where(events.c.id == event_id)).scalar()

@@ -139,11 +139,16 @@ def test_viewer_sees_that_there_is_sound_and_does_not_get_it(desk: ServedClips) 
 
 def test_unknown_names_lead_nowhere(desk: ServedClips) -> None:
     event = desk.events()[0]["id"]
-    assert desk.get("events/nothing/clips")["state"] == "none"
-    for path in (f"{event}/clips/clip.json", f"{event}/clips/..%2f..%2ftokens.yaml", "nothing/clips/enhanced.flac"):
+    for path in (f"{event}/clips/clip.json", f"{event}/clips/..%2f..%2ftokens.yaml", "nothing/clips"):
         assert desk.ask(f"events/{path}").status_code == 404
-    assert desk.ask("events/nothing/clips", "DELETE").status_code == 404
-    assert desk.ask("events/nothing/clips/keep", "PUT", json={"keep": True}).status_code == 404
+
+
+def test_recordings_outlive_their_event_in_the_history(desk: ServedClips) -> None:
+    shutil.copytree(desk.folder / desk.events()[0]["id"], desk.folder / "old-1")
+    assert desk.ask("events/old-1").status_code == 404
+    assert desk.get("events/old-1/clips")["state"] == "stored"
+    assert desk.ask("events/old-1/clips", "DELETE").status_code == 200
+    assert desk.ask("events/old-1/clips").status_code == 404
 
 
 DAMAGES: dict[str, Any] = {

@@ -10,7 +10,7 @@ from fastapi import Response
 from websockets.sync.client import connect
 
 from api_contract import Contract
-from livessl.server.api import live, routes
+from livessl.server.api import live, queries, routes
 from livessl.server.fanout import Fanout
 from small_site import HANG_S, running_server, site_of
 
@@ -84,3 +84,12 @@ def test_a_status_that_is_not_described_is_found(contract: Contract, monkeypatch
     with contract.broken() as faults, running_server(site_of()) as server:
         assert httpx.get(f"{server.url}/api/v1/site").status_code == 418
     assert "GET /api/v1/site -> 418: status 418 with content 'application/json' is not described" in faults
+
+
+def test_a_refusal_that_names_nothing_of_the_request_is_found(
+    contract: Contract, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(routes, "unprocessable", lambda _, what: queries.unprocessable("colour", what))
+    with contract.broken() as faults, running_server(site_of()) as server:
+        assert httpx.get(f"{server.url}/api/v1/map?view=volume").status_code == 422
+    assert faults == ["GET /api/v1/map -> 422: ('query', 'colour') is nothing of the request"]

@@ -137,6 +137,12 @@ def test_wrong_filter_is_refused_with_a_reason(server: Server, query: str, where
     assert fault["msg"].startswith(reason)
 
 
+def test_wrong_number_to_resume_after_is_refused_as_the_header_that_it_came_in(server: Server) -> None:
+    response = httpx.get(f"{server.url}/api/v1/stream", headers={"Last-Event-ID": "x"})
+    [fault] = response.json()["detail"]
+    assert fault["loc"] == ["header", "last-event-id"]
+
+
 def test_client_that_does_not_read_costs_a_bounded_queue_and_is_cut(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(connections, "STALLED_S", 0.1)
     with running_server(site_of()) as server:

@@ -57,19 +57,29 @@ def clip_routes(parts: Parts) -> APIRouter:
         }
         return as_json({"v": API_VERSION, **state_of(clips), **limits})
 
-    @router.get("/events/{event_id}/clips", response_model=clip_schema.EventClips)
+    @router.get(
+        "/events/{event_id}/clips",
+        response_model=clip_schema.EventClips,
+        responses=errors(404, 503, texts={404: "There is no event of that id, and no recordings of one."}),
+    )
     def get_event_clips(event_id: str) -> Response:
-        """Recordings of an event. Where `state` is `unreadable`, `problem` says why."""
+        """Recordings of an event. Where `state` is `unreadable`, `problem` says why.
+
+        Recordings can outlive their event in the history.
+        """
         clip: Clip | None = None
         problem = None
         try:
             clip = None if clips is None else clips.folder.read(event_id)
         except UnreadableClipError as error:
             problem = str(error)
+        state = _state(clips, event_id, clip, problem)
+        if state == "none" and parts.store.get(event_id) is None:
+            raise HTTPException(404, f"no event {event_id!r}")
         found = {
             "v": API_VERSION,
             "event_id": event_id,
-            "state": _state(clips, event_id, clip, problem),
+            "state": state,
             "problem": problem,
             "keep": clip is not None and clip.keep,
             "position_m": None if clip is None else clip.content["position_m"],

@@ -147,7 +147,7 @@ def _refusals() -> Iterator[None]:
     except CalibrationFileError as error:
         raise HTTPException(503, str(error)) from error
     except ValueError as error:
-        raise unprocessable("set-up", str(error)) from error
+        raise unprocessable(None, str(error), "body") from error
 
 
 def _answer(proposal: Proposal) -> Response:

@@ -131,9 +131,10 @@ def check_parameters(given: Iterable[str], model: type[BaseModel]) -> None:
             raise ValueError(unknown_parameter(name, list(model.model_fields)))
 
 
-def unprocessable(name: str, what: str, part: str = "query") -> HTTPException:
-    """A 422 in FastAPI's form, for a query parameter, or a key of another part, whose value is not valid."""
-    return HTTPException(422, [{"type": "value_error", "loc": [part, name], "msg": what}])
+def unprocessable(name: str | None, what: str, part: str = "query") -> HTTPException:
+    """A 422 in FastAPI's form, for a query parameter or a key of another part; None stands for the whole part."""
+    loc = [part] if name is None else [part, name]
+    return HTTPException(422, [{"type": "value_error", "loc": loc, "msg": what}])
 
 
 async def refuse_request(_request: Request, error: Exception) -> Response:

@@ -71,7 +71,7 @@ def set_up_routes(parts: Parts) -> APIRouter:
             findings = verify_set_up(site, [sound.observations for sound in sounds], places_m)
             next_m = next_clap_place(site, places_m, PLACE_STD_M)
         except PlaceOutsideError as error:
-            raise unprocessable("claps", str(error)) from error
+            raise unprocessable("claps", str(error), "body") from error
         finally:
             one_at_a_time.release()
         claps = [_clap(sound, place_m) for sound, place_m in zip(sounds, places_m, strict=True)]

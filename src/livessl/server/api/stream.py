@@ -16,6 +16,9 @@ from livessl.server.parts import Parts
 
 STREAM: Final = "/api/v1/stream"
 
+LAST_EVENT_ID: Final = "last-event-id"
+"""Header in which a browser names the last message that it received."""
+
 HEARTBEAT_S: Final = 10.0
 """Longest silence in seconds. A heartbeat lets proxies and clients distinguish a quiet site from a dead connection.
 It also gives the latest number to a client whose filter admits little."""
@@ -69,9 +72,10 @@ def stream_route(parts: Parts) -> APIRouter:
             zones = parts.zone_book.current.zones
             wanted = queries.live_filter(zones, kinds, min_confidence, zone, track, max_rate_hz)
             since = queries.whole_number("since_seq", since_seq)
-            since = since if not last_event_id else queries.whole_number("Last-Event-ID", last_event_id)
+            since = since if not last_event_id else queries.whole_number(LAST_EVENT_ID, last_event_id)
         except ValueError as error:
-            raise queries.unprocessable(str(error).partition(":")[0], str(error)) from error
+            name = str(error).partition(":")[0]
+            raise queries.unprocessable(name, str(error), "header" if name == LAST_EVENT_ID else "query") from error
         if "head_only" in request.scope:
             return Response(headers=_HEADERS)
         arrays = await asyncio.to_thread(parts.array_states.describe)

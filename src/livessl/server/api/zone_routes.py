@@ -68,13 +68,16 @@ def zone_routes(parts: Parts) -> APIRouter:
         parts.journal.configuration(f"zone {name}", who, f"{who!r} has deleted zone {name!r}", {"zone": None})
         return as_json({"v": API_VERSION, "name": name})
 
-    @router.get("/api/v1/zone-changes", response_model=zone_schema.Changes)
+    @router.get("/api/v1/zone-changes", response_model=zone_schema.Changes, responses=errors(404, texts=_TEXTS))
     def get_changes(
         zone: Annotated[str | None, Query(description="only changes in this zone")] = None,
         limit: Annotated[int, Query(ge=1, le=1000, description="most changes")] = 50,
     ) -> Response:
         """Tracks that entered, left or loitered in a zone, newest first; a restart forgets them."""
         changes = [change for change in reversed(tuple(parts.presence.changes)) if zone in (None, change["zone"])]
+        zones = book.current.zones
+        if zone is not None and zone not in zones and not changes:  # a zone that was deleted keeps its changes
+            raise HTTPException(404, f"no zone {zone!r}; zones are {', '.join(zones) or 'none'}")
         return as_json({"v": API_VERSION, "changes": changes[:limit]})
 
     @router.get(
@@ -101,7 +104,7 @@ def _refusals() -> Iterator[None]:
     try:
         yield
     except ValueError as error:
-        raise unprocessable("zone", str(error)) from error
+        raise unprocessable(None, str(error), "body") from error
     except LookupError as error:
         raise HTTPException(404, str(error)) from error
     except ZoneRefusedError as error:

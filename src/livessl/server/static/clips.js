@@ -32,6 +32,7 @@ export class Clips {
     try {
       const response = await get(this.#url(id));
       if (response.ok) found = await response.json();
+      else if (response.status === 404) found = { state: "none" }; // the history does not have the event any more
     } catch (error) {
       console.warn("livessl: clips:", error.message);
     }
