@@ -19,7 +19,7 @@ from small_site import RATE_HZ, scene, site_of
 
 SOUNDS = 3
 START_S = 0.2
-"""What is cut off, in seconds, so that the fan runs already when the recording begins."""
+"""Seconds that are cut off, so that the fan runs already when the recording begins."""
 
 
 @cache

@@ -1,4 +1,4 @@
-"""In halls and yards sound arrays agree, and positions are right within what they claim."""
+"""Arrays with the right poses agree in halls and yards, and errors are as large as the covariance says."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A steady background and close talkers yield no source where nobody is."""
+"""A steady background and close talkers yield no source at an empty place."""
 
 from __future__ import annotations
 
@@ -80,9 +80,9 @@ def talk(rng: np.random.Generator, count: int) -> FloatArray:
 
 
 def test_two_talkers_near_each_other_are_found_where_they_are() -> None:
-    """One place or both. A second one is as certain as every event that is told.
+    """Both places are found, or one. A second one is as certain as every published event.
 
-    Of 140 other pairs that were drawn like these, seven had a place at which nobody was.
+    Of 140 other pairs that were drawn like these, seven had an answer at an empty place.
     """
     count, nowhere = (QUIET + 32) * FRAME, 0
     for seed in range(10):
