@@ -182,6 +182,16 @@ def test_sound_settings_cause_no_guess(changes: Changes) -> None:
     assert said_of(changes) == []
 
 
+@settings(max_examples=25, deadline=None)
+@given(length_m=st.floats(100.0, 2000.0), points=st.integers(50, 200))
+def test_a_coarse_grid_is_usual_in_a_yard(length_m: float, points: int) -> None:
+    """From a hundred points along the longest edge; before, centimetres are more likely."""
+    spacing_m = math.ceil(length_m / points)
+    changes: Changes = {"room.size_m": [length_m, length_m / 2.0, 10.0], "grid.spacing_m": spacing_m}
+    said = [one for one in said_of(changes) if one.startswith("grid.spacing_m: grid points")]
+    assert bool(said) == (100 * spacing_m > length_m)
+
+
 def test_what_a_guess_says_is_valid_when_it_is_written() -> None:
     """The cure of a fault can be pasted into the file."""
     text = text_of({f"{NORTH}.position_m": [1900, 1300, 1400]})

@@ -29,6 +29,9 @@ TALL_M: Final = 100.0
 COARSE_M: Final = 1.0
 """Grid spacing, in metres, from which a smaller unit is more likely: positions would be a step across the floor."""
 
+MANY_POINTS: Final = 100
+"""Number of grid points along the longest edge from which a coarse grid is meant: that of a yard."""
+
 USUAL_SPACING_M: Final = 0.1
 """Grid spacing, in metres, next to which a value in another unit is sought."""
 
@@ -186,7 +189,7 @@ def _lengths(site: Site) -> Iterator[str]:
             f"[{', '.join(f'{x / 100:g}' for x in size_m)}], from centimetres?"
         )
     spacing_m = site.grid.spacing_m
-    if spacing_m >= COARSE_M:
+    if spacing_m >= COARSE_M and MANY_POINTS * spacing_m > max(size_m):
         per_metre, unit = min(UNITS, key=lambda one: abs(math.log(spacing_m / one[0] / USUAL_SPACING_M)))
         yield (
             f"grid.spacing_m: grid points {spacing_m:g} m apart are unlikely; did you mean "

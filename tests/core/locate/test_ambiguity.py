@@ -154,6 +154,43 @@ def test_arrays_on_one_line_report_a_circle() -> None:
         assert np.linalg.norm((each.position_m - [2.2, 2.5, 1.3])[1:]) == pytest.approx(1.2, abs=TOLERANCE_M)
 
 
+@settings(max_examples=4, deadline=None)
+@given(
+    yaw_deg=st.floats(0.0, 180.0),
+    middle_m=st.tuples(st.floats(1.9, 2.3), st.floats(2.3, 2.8), st.floats(1.2, 1.5)),
+    spacing_m=st.floats(0.06, 0.12),
+    along_m=st.floats(-0.4, 0.4),
+    radius_m=st.floats(0.7, 1.1),
+    around_deg=st.floats(0.0, 360.0),
+)
+def test_lines_in_any_direction_report_a_circle_around_them(
+    yaw_deg: float,
+    middle_m: tuple[float, float, float],
+    spacing_m: float,
+    along_m: float,
+    radius_m: float,
+    around_deg: float,
+) -> None:
+    turn, around = np.deg2rad(yaw_deg), np.deg2rad(around_deg)
+    axis = np.array([np.cos(turn), np.sin(turn), 0.0])
+    across = np.array([-np.sin(turn), np.cos(turn), 0.0])
+    arrays = [
+        ArraySpec(name, posed(line(spacing_m, 4), middle_m + off_m * axis, yaw_deg), BAND_HZ)
+        for name, off_m in (("west", -0.9), ("east", 0.9))
+    ]
+    outwards = np.cos(around) * across + np.sin(around) * np.array([0.0, 0.0, 1.0])
+    found = located(arrays, middle_m + along_m * axis + radius_m * outwards)
+    answer, why = judged(found, arrays)
+    assert answer is Status.DIRECTION_ONLY
+    assert why is not None
+    assert "all microphones lie on one line" in why
+    assert len(found.candidates) > 2
+    for each in found.candidates:
+        from_middle_m = each.position_m - middle_m
+        assert from_middle_m @ axis == pytest.approx(along_m, abs=TOLERANCE_M)
+        assert np.linalg.norm(np.cross(from_middle_m, axis)) == pytest.approx(radius_m, abs=TOLERANCE_M)
+
+
 def test_a_search_in_a_plane_leaves_front_and_back_of_a_line() -> None:
     plane = Grid((*ROOM.bounds_m[:2], (1.3, 1.3)), 0.1)
     arrays = [straight("west", [1.2, 2.5, 1.3]), straight("east", [3.0, 2.5, 1.3])]

@@ -114,6 +114,23 @@ def test_steady_noise_from_the_start_is_quiet() -> None:
     assert [isinstance(message, Frame) for cut in cuts for message in made.push(cut, framer.state)] == [True, True]
 
 
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 1 << 30), begin=st.floats(0.8, 1.0), slope=st.floats(0.0, 0.8))
+def test_steady_noise_is_quiet_although_the_device_fades_in(seed: int, begin: float, slope: float) -> None:
+    """The noise begins towards the end of the first frame; it is white, or the low noise of a fan."""
+    count = 80 * N
+    frequency_hz = np.fft.rfftfreq(count, 1.0 / RATE_HZ)
+    spectrum = np.fft.rfft(sound([1.0] * 80, seed)) / np.maximum(frequency_hz, 100.0) ** slope
+    noise = np.fft.irfft(spectrum, count)
+    noise[:, : round(begin * N)] = 0.0
+    assert frame_indices(run((1e-2 * noise / noise.std()).astype(np.float32)), Frame) == []
+
+
+def test_sound_that_begins_in_the_third_frame_is_found_however_long_it_lasts() -> None:
+    messages = run(sound([QUIET] * 2 + [LOUD] * 60 + [QUIET] * 20))
+    assert [frame.frame_index - START for frame in frames_of(messages) if frame.active] == list(range(2, 62))
+
+
 def test_short_stream_gives_its_messages_at_its_end() -> None:
     assert frame_indices(run(sound([QUIET, QUIET, LOUD, QUIET])), Frame) == [0, 1, 2, 3]
     assert run(sound([QUIET])[:, :400]) == []

@@ -140,6 +140,19 @@ def test_selected_event_is_marked_on_the_plan(browser: Browser, server: Server) 
         page.wait_for_function(f"before => ({picture})() !== before", arg=marked, timeout=1000 * HANG_S)
 
 
+def test_refused_export_says_what_is_wrong_with_each_part(browser: Browser, server: Server) -> None:
+    faults = [
+        {"loc": ["query", name], "msg": f"Value error, {name} is wrong", "type": "x"} for name in ("since", "zone")
+    ]
+    with faultless_page(browser) as page:
+        visit(page, f"{server.url}/history")
+        page.route("**/events.csv*", lambda route: route.fulfill(status=422, json={"detail": faults}))
+        page.get_by_role("button", name="CSV").click()
+        expect(page.get_by_test_id("banner")).to_have_text(
+            "The history could not be read: since is wrong; zone is wrong", timeout=1000 * HANG_S
+        )
+
+
 def test_export_is_saved_as_a_file(browser: Browser, server: Server, tmp_path: Path) -> None:
     with faultless_page(browser) as page:
         visit(page, f"{server.url}/history?zone=door")

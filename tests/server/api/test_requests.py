@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import socket
 from collections.abc import Iterator
 from typing import Any
@@ -57,6 +58,17 @@ def test_head_answers_as_get_without_the_body(client: httpx.Client, path: str) -
     assert {name: value for name, value in head.headers.items() if name not in changing} == {
         name: value for name, value in get.headers.items() if name not in changing
     }
+
+
+def test_every_described_get_route_answers_head(client: httpx.Client, described: dict[str, Any]) -> None:
+    """Also those that are added later; parts of paths are names that do not exist."""
+    routes = sorted(path for path, methods in described["paths"].items() if "get" in methods)
+    assert len(routes) > 20
+    for path in (re.sub(r"{\w+}", "1", route) for route in routes):
+        with client.stream("GET", path) as answer:  # a stream has no end
+            status = answer.status_code
+        head = client.head(path)
+        assert (head.status_code, head.content) == (status, b""), path
 
 
 def test_connection_lives_on_after_head(client: httpx.Client) -> None:
@@ -136,6 +148,21 @@ def test_unknown_parameter_of_a_websocket_closes_it(server: Server, path: str, r
 @pytest.mark.parametrize("time", ["2024-01-01t00:00:00z", "2024-01-01T00:00:00z", "2024-01-01t00:00:00.5+01:00"])
 def test_times_in_lower_case_are_understood(client: httpx.Client, time: str) -> None:
     assert client.get(f"{API}/events", params={"since": time, "until": time}).status_code == 200
+
+
+def test_every_route_understands_times_in_lower_case(client: httpx.Client, described: dict[str, Any]) -> None:
+    timed = [
+        (path, parameter["name"])
+        for path, methods in described["paths"].items()
+        for parameter in methods.get("get", {}).get("parameters", ())
+        if "date-time" in str(parameter["schema"]) and "{" not in path
+    ]
+    assert len(timed) >= 4
+    for path, name in timed:
+        upper, lower = (
+            client.get(path, params={name: time}) for time in ("2024-01-01T00:00:00Z", "2024-01-01t00:00:00z")
+        )
+        assert lower.status_code == upper.status_code != 422, (path, name)
 
 
 def test_answers_are_described_by_models(described: dict[str, Any]) -> None:

@@ -105,7 +105,8 @@ class CausalActivity:
         return self._floor_power
 
     def prime(self, floor_power: float) -> None:
-        """Start from a known background, full scale squared."""
+        """Start from a known background, full scale squared, as though it had lasted until now."""
+        self._latest.extend([floor_power] * _FLOOR_SMOOTHING)
         self._smoothed.append(floor_power)
         self._floor_power = min(self._smoothed)
 

@@ -22,7 +22,8 @@ RECENT_S: Final = 12.0
 event, its pre-roll and the way of a backfill request together."""
 
 WARM_UP_FRAMES: Final = 10
-"""Number of frames held back at the start; the quietest of them is the first estimate of the background."""
+"""Number of frames held back at the start. The quietest of them is the first estimate of the background, without the
+first frame, in which a device may fade in."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +126,8 @@ class Segmenter:
         held, self._warm_up = self._warm_up or [], None
         levels = [self._background.changing_power(known.spectrum, known.power) for _, known in held]
         if held:
-            self._activity.prime(min(levels))
+            first = 1 if len(held) >= WARM_UP_FRAMES else 0
+            self._activity.prime(min(levels[first:]))
         return [
             message
             for (cut, known), level in zip(held, levels, strict=True)

@@ -1,6 +1,6 @@
 // The hub's page: reads sites and events again and again, and shows what has changed.
 
-import { get, onTokenNeeded, useToken } from "./site/access.js";
+import { get, onTokenNeeded, refusal, useToken } from "./site/access.js";
 import { el, find, write } from "./site/dom.js";
 import { ago, percent, position, when } from "./site/format.js";
 
@@ -16,7 +16,7 @@ let shown = "";
 /** An answer of the API, or an error with what the server says of it. */
 async function read(path) {
   const response = await get(new URL(path, API));
-  if (!response.ok) throw new Error((await response.json()).detail ?? `status ${response.status}`);
+  if (!response.ok) throw new Error(await refusal(response));
   return response.json();
 }
 

@@ -1,6 +1,6 @@
 // The page's start: connects the messages of the server to the model, and the model to the panels and plans.
 
-import { get, getStream, onTokenNeeded, postLong, put, useToken } from "./access.js";
+import { get, getStream, onTokenNeeded, postLong, put, refusal, useToken } from "./access.js";
 import { AlertsPanel } from "./alerts.js";
 import { ArraysPanel } from "./arrays.js";
 import { Clips } from "./clips.js";
@@ -175,13 +175,6 @@ async function explain(reason, failures) {
   }
 }
 
-/** What a server or proxy says when it refuses a request. */
-async function refusal(response) {
-  const type = response.headers.get("Content-Type") ?? "";
-  const text = type.startsWith("text/plain") ? (await response.text()).trim() : "";
-  return text || `the server answered ${response.status}`;
-}
-
 async function getJson(path) {
   const response = await get(new URL(path, API));
   if (!response.ok) throw new Error(`${path}: the server answered ${response.status}`);
@@ -194,14 +187,8 @@ async function postJson(path, value) {
   if (response.ok) return response.json();
   const error = new Error(`${path}: the server answered ${response.status}`);
   const isJson = response.headers.get("Content-Type")?.startsWith("application/json") ?? false;
-  if (isJson && response.status !== 401) error.told = told((await response.json()).detail);
+  if (isJson && response.status !== 401) error.told = await refusal(response);
   throw error;
-}
-
-/** A refusal as a sentence: the server's text, or what is wrong with each part of the request. */
-function told(detail) {
-  const parts = typeof detail === "string" ? [detail] : (detail ?? []).map(({ msg }) => msg.replace(/^Value error, /, ""));
-  return parts.length === 0 ? undefined : parts.join("; ");
 }
 
 /** Run `load`; if it fails, try again a few times. */

@@ -1,6 +1,6 @@
 // The recordings of an event, at the end of its details: to listen to, to save, to keep for ever and to delete.
 
-import { get, getStream, put, remove } from "./access.js";
+import { get, getStream, put, refusal, remove } from "./access.js";
 import { el } from "./dom.js";
 import { number } from "./format.js";
 
@@ -149,7 +149,7 @@ function missing({ gaps_s: gaps }) {
 }
 
 async function check(response) {
-  if (!response.ok) throw new Error((await response.json()).detail ?? `the server answered ${response.status}`);
+  if (!response.ok) throw new Error(await refusal(response));
   return response;
 }
 

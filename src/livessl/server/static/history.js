@@ -1,6 +1,6 @@
 // The history's page: reads the filters, loads the events and the heat map that they admit, and marks an event.
 
-import { get, getStream, onTokenNeeded, useToken } from "./access.js";
+import { get, getStream, onTokenNeeded, refusal, useToken } from "./access.js";
 import { colourScale, paintScale } from "./colour-map.js";
 import { el, find, write } from "./dom.js";
 import { EventList } from "./events.js";
@@ -71,8 +71,7 @@ function writeAddress(parameters) {
 async function getJson(path) {
   const response = await get(new URL(path, API));
   if (response.ok) return response.json();
-  const { detail } = await response.json().catch(() => ({}));
-  throw new Error(typeof detail === "string" ? detail : detail?.[0]?.msg ?? `the server answered ${response.status}`);
+  throw new Error(await refusal(response));
 }
 
 /** Search anew, from the newest event on, or from a cursor: { cursor } or { after }. */
@@ -197,7 +196,7 @@ function applyTheme() {
 async function save(format) {
   try {
     const response = await getStream(new URL(`events.${format}?${filters()}`, API));
-    if (!response.ok) throw new Error((await response.json()).detail);
+    if (!response.ok) throw new Error(await refusal(response));
     const address = URL.createObjectURL(await response.blob());
     el("a", { href: address, download: `${model.site?.site ?? "livessl"}-events.${format}` }).click();
     setTimeout(() => URL.revokeObjectURL(address), 60000);

@@ -1,6 +1,6 @@
 // The form in which operators draw, change and delete zones; corners are set on the floor plan or typed.
 
-import { put, remove } from "./access.js";
+import { put, refusal, remove } from "./access.js";
 import { el, find, write } from "./dom.js";
 import { REACH } from "./plan-zones.js";
 
@@ -174,7 +174,7 @@ export class ZoneEditor {
     try {
       const response = await asking;
       if (response.ok) this.#close();
-      else write(this.fault, refusal(response.status, await response.json()));
+      else write(this.fault, await refusal(response));
     } catch (error) {
       write(this.fault, `The server does not answer: ${error.message}`);
     }
@@ -190,11 +190,4 @@ function parse(text) {
 
 function onRaster(metres) {
   return Number((Math.round(metres / RASTER_M) * RASTER_M).toFixed(2));
-}
-
-/** The server's reason: a sentence, or one for each fault of the zone. */
-function refusal(status, { detail }) {
-  if (typeof detail === "string") return detail;
-  const faults = (detail ?? []).map(({ msg }) => msg.replace(/^Value error, /, ""));
-  return faults.join("; ") || `the server answered ${status}`;
 }

@@ -1,6 +1,6 @@
 // Locating an event again from its recordings, at the end of them: both answers beside each other, and on the plans.
 
-import { postLong } from "./access.js";
+import { postLong, refusal } from "./access.js";
 import { el, write } from "./dom.js";
 import { number, percent, position } from "./format.js";
 
@@ -47,10 +47,8 @@ export class Relocate {
 
   async #ask(id, wanted) {
     const response = await postLong(new URL(`events/${encodeURIComponent(id)}/relocate`, this.api), wanted);
-    const isJson = response.headers.get("Content-Type")?.startsWith("application/json") ?? false;
-    const body = isJson ? await response.json() : {};
-    if (response.ok) return body;
-    throw new Error(typeof body.detail === "string" ? body.detail : `the server answered ${response.status}`);
+    if (response.ok) return response.json();
+    throw new Error(await refusal(response));
   }
 }
 
