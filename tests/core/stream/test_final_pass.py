@@ -11,6 +11,7 @@ from test_fusion import HANG_OVER, START, Arrivals, frame, mark, node, now_ns, s
 from livessl.core.stream.array_health import LOST_NS
 from livessl.core.stream.final_pass import FinalResults, TwoPassFusion
 from livessl.core.stream.held_frames import HEADER_BYTES, HOLD_BYTES, HOLD_NS
+from livessl.core.stream.reception import FinalReception
 from livessl.core.types import FRAME_NS, Event, Frame, Message
 
 NAMES = ("north", "south")
@@ -215,3 +216,24 @@ def test_only_active_frames_of_excluded_arrays_are_changed() -> None:
     assert state.without_excluded(quiet) is quiet
     assert state.without_excluded(mark("north", 1)) == mark("north", 1)
     assert state.without_excluded(south) is south
+
+
+def test_frames_of_an_array_that_had_sent_nothing_are_too_late_as_well() -> None:
+    into = two_passes(hold_ns=5 * 1_000_000_000)
+    play(into, node("north", range(40, 46), range(300)), 300)
+    into.greet("south", (START + 38, START + 52), now_ns(300))
+    play(into, [(301.0, frame("south", k)) for k in range(40, 46)], 301, 301)
+    assert into.input.too_late == {"north": 0, "south": 6}
+    assert into.input.duplicates == {"north": 0, "south": 0}
+
+
+def test_what_was_given_up_once_is_forgotten_when_an_array_has_caught_up() -> None:
+    reception = FinalReception()
+    reception.take_mark(100)
+    reception.forget(150)  # given up from 101 on
+    reception.take_mark(400)
+    reception.forget(380)
+    assert reception.is_new(140)
+    reception.forget(450)  # given up from 401 on
+    assert not reception.is_new(140)
+    assert reception.is_new(420)

@@ -75,3 +75,57 @@ def test_samples_are_dropped_anew_only_after_more_have_come() -> None:
     assert not held.expire(0, None)
     push_sound(held, 130, ARRAYS[:2])
     assert held.expire(0, None)
+
+
+def frames_at(held: HeldFrames, frame_indices: range, arrays: list[str], power: float) -> None:
+    for frame_index in frame_indices:
+        for array in arrays:
+            held.push(frame(array, frame_index, power), frame_index, 0)
+
+
+def test_arrays_that_stay_are_the_same_when_samples_are_dropped_again() -> None:
+    """Others become clearer while the sound goes on; nobody has the beginning of it then but those that were kept."""
+    held = HeldFrames(hold_bytes=20 * len(ARRAYS) * FRAME_BYTES)
+    for first, clearest in ((100, ARRAYS[:KEPT_ARRAYS]), (120, ARRAYS[KEPT_ARRAYS:])):
+        frames_at(held, range(first, first + 20), clearest, 1e-1)
+        frames_at(held, range(first, first + 20), [a for a in ARRAYS if a not in clearest], 1e-4)
+        assert held.expire(0, None)
+    frames = held.pop_until(200)
+    assert {f.frame_index for f in frames if f.samples.size and f.array in ARRAYS[:KEPT_ARRAYS]} == set(range(100, 140))
+
+
+def test_array_that_becomes_clearer_is_kept_besides_the_first_ones() -> None:
+    held = HeldFrames(hold_bytes=2 * 20 * len(ARRAYS) * FRAME_BYTES)
+    frames_at(held, range(98, 100), ARRAYS, 1e-7)
+    louder = ARRAYS[KEPT_ARRAYS : KEPT_ARRAYS + 1]
+    for first, clearest, power in ((100, ARRAYS[:KEPT_ARRAYS], 1e-2), (120, louder, 1e-1)):
+        frames_at(held, range(first, first + 20), clearest, power)
+        frames_at(held, range(first, first + 20), [a for a in ARRAYS if a not in clearest], 1e-4)
+    assert held.expire(0, None)
+    assert with_samples(held.pop_until(200)) == set(ARRAYS[: KEPT_ARRAYS + 1])
+
+
+def test_without_a_quiet_frame_the_most_powerful_arrays_are_the_clearest() -> None:
+    held = HeldFrames(hold_bytes=20 * len(ARRAYS) * FRAME_BYTES)
+    frames_at(held, range(100, 120), ARRAYS[:KEPT_ARRAYS], 1e-5)
+    frames_at(held, range(100, 120), ARRAYS[KEPT_ARRAYS:], 1e-2)
+    assert held.expire(0, None)
+    assert with_samples(held.pop_until(200)) == set(ARRAYS[KEPT_ARRAYS:])
+
+
+def test_nothing_is_given_up_that_has_not_come() -> None:
+    held = HeldFrames(hold_bytes=5 * FRAME_BYTES)
+    frames_at(held, range(1000, 1010), ["a0"], 1e-2)
+    held.expire(0, 990)
+    assert held.forced_until == 1009
+
+
+def test_samples_go_before_anything_is_given_up() -> None:
+    """In small steps, in which samples would not be due to be dropped yet."""
+    held = HeldFrames(hold_bytes=100 * FRAME_BYTES)
+    for frame_index in range(1000, 1012):  # of four arrays, some 50 frames are left with samples
+        frames_at(held, range(frame_index, frame_index + 1), ARRAYS, 1e-4)
+        frames_at(held, range(frame_index, frame_index + 1), ["a8", "a9", "a10"], 1e-2)
+        held.expire(0, 990)
+    assert held.forced_until is None
+    assert held.nbytes <= 100 * FRAME_BYTES

@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import heapq
 from collections import Counter, deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import groupby
 from typing import Final
 
 from livessl.core.stream.load_policy import Clearest
@@ -37,13 +39,21 @@ THINNED_EVERY: Final = 0.125
 
 KEPT_ARRAYS: Final = 4
 """Arrays of each sound whose samples stay when memory gets short: the clearest, as many as an overloaded server locates
-a sound from (`load_policy.LEVELS`)."""
+a sound from (`load_policy.LEVELS`). An array that becomes clearer while the sound goes on is kept besides them."""
 
 LONGEST_FRAMES: Final = 200
-"""Frames after which a sound that goes on counts as another one when its clearest arrays are chosen: 10 s."""
+"""Frames after which the clearest arrays of a sound that goes on are chosen anew: 10 s."""
 
 FORCED_FRAMES: Final = 40
-"""Frames that are no longer awaited when there is no memory left: 2 s at a time."""
+"""Most frame indices that are no longer awaited at a time when there is no memory left: 2 s."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Choice:
+    """The arrays whose samples stay, from a frame index on."""
+
+    first: int
+    arrays: frozenset[str]
 
 
 class HeldFrames:
@@ -62,7 +72,8 @@ class HeldFrames:
         self._hold_bytes = hold_bytes
         self._waiting: list[tuple[int, str, Frame]] = []
         self._came: deque[tuple[int, int]] = deque()  # when it came, its frame index
-        self._thinned_bytes = 0  # what was held after samples were dropped last
+        self._thinned_bytes = 0  # what is left of what was held after samples were dropped last
+        self._choices: dict[int, _Choice] = {}  # by frame index, where samples were dropped
         self.nbytes = 0
         """Memory of the frames that are held, in bytes."""
         self.overdue_until: int | None = None
@@ -84,16 +95,18 @@ class HeldFrames:
 
     def pop_until(self, last: int) -> list[Frame]:
         """Return the frames up to a frame index in order, and hold them no longer."""
+        before = self.nbytes
         frames: list[Frame] = []
         while self._waiting and self._waiting[0][0] <= last:
-            frame = heapq.heappop(self._waiting)[2]
+            frame_index, _, frame = heapq.heappop(self._waiting)
+            self._choices.pop(frame_index, None)
             self.nbytes -= _bytes_of(frame)
             frames.append(frame)
-        self._thinned_bytes = min(self._thinned_bytes, self.nbytes)
+        self._thinned_bytes = max(0, self._thinned_bytes - (before - self.nbytes))
         return frames
 
     def expire(self, now_ns: int, position: int | None, *, shedding: bool = False) -> Counter[str]:
-        """Advance `overdue_until`, and make room: drop samples, then advance `forced_until`.
+        """Advance `overdue_until`, and make room: drop samples, and only if that is not enough advance `forced_until`.
 
         Parameters
         ----------
@@ -116,11 +129,13 @@ class HeldFrames:
                 break
             self._came.popleft()
         most = self._hold_bytes // SHEDDING if shedding else self._hold_bytes
-        full = self.nbytes > THINNED_FROM * most
-        dropped = self._thin() if full and self.nbytes - self._thinned_bytes > THINNED_EVERY * most else Counter[str]()
         has_gone = self.forced_until is None or position is None or position >= self.forced_until
-        if self.nbytes > most and self.first is not None and has_gone:
-            self.forced_until = later(self.forced_until, self.first + FORCED_FRAMES)
+        must_force = self.nbytes > most and has_gone
+        is_due = self.nbytes > THINNED_FROM * most and self.nbytes - self._thinned_bytes > THINNED_EVERY * most
+        dropped = self._thin() if must_force or is_due else Counter[str]()
+        if must_force and self.nbytes > most and self.first is not None:
+            newest = max(frame_index for frame_index, _, _ in self._waiting)
+            self.forced_until = later(self.forced_until, min(self.first + FORCED_FRAMES, newest))
         return dropped
 
     def reindex(self, frames_ahead: Callable[[str], int]) -> None:
@@ -129,19 +144,28 @@ class HeldFrames:
         heapq.heapify(self._waiting)
 
     def _thin(self) -> Counter[str]:
-        """Keep the samples of the clearest arrays of each sound only; return the frames of each array without."""
+        """Keep the samples of the clearest arrays of each sound only; return the frames of each array without.
+
+        Where samples were dropped before, the same arrays stay: with others, nothing might be left of a sound.
+        """
+        ordered = sorted(self._waiting, key=lambda held: held[:2])  # sorted, it is a heap as well
+        rows = [(k, [frame for _, _, frame in held]) for k, held in groupby(ordered, key=lambda held: held[0])]
         dropped: Counter[str] = Counter()
-        thinned: list[tuple[int, str, Frame]] = []
-        for sound in _sounds(sorted(self._waiting, key=lambda held: held[:2])):
-            kept = _clearest([frame for _, _, frame in sound])
-            for frame_index, array, frame in sound:
-                if frame.samples.size and array not in kept:
+        self._waiting = []
+        choice: _Choice | None = None
+        for place, (frame_index, frames) in enumerate(rows):
+            if place and frame_index > rows[place - 1][0] + 1:  # no array has sent this far: another sound
+                choice = None
+            choice = self._choices.get(frame_index, choice)
+            if choice is None or frame_index >= choice.first + LONGEST_FRAMES:
+                choice = _Choice(frame_index, _clearest(rows[place : place + LONGEST_FRAMES]))
+            self._choices[frame_index] = choice
+            for frame in frames:
+                if frame.samples.size and frame.array not in choice.arrays:
                     self.nbytes -= frame.samples.nbytes
-                    dropped[array] += 1
-                    thinned.append((frame_index, array, frame.without_samples()))
-                else:
-                    thinned.append((frame_index, array, frame))
-        self._waiting = thinned  # sorted, and so a heap
+                    dropped[frame.array] += 1
+                    frame = frame.without_samples()
+                self._waiting.append((frame_index, frame.array, frame))
         self._thinned_bytes = self.nbytes
         return dropped
 
@@ -150,23 +174,19 @@ def _bytes_of(frame: Frame) -> int:
     return HEADER_BYTES + int(frame.samples.nbytes)
 
 
-def _sounds(held: list[tuple[int, str, Frame]]) -> Iterator[list[tuple[int, str, Frame]]]:
-    """Yield the frames of each sound: between two sounds are frame indices of which no array has sent any."""
-    sound: list[tuple[int, str, Frame]] = []
-    for one in held:
-        if sound and (one[0] > sound[-1][0] + 1 or one[0] >= sound[0][0] + LONGEST_FRAMES):
-            yield sound
-            sound = []
-        sound.append(one)
-    if sound:
-        yield sound
+def _clearest(rows: Sequence[tuple[int, list[Frame]]]) -> frozenset[str]:
+    """Return the arrays whose samples stay, of a sound that begins with the first of these rows.
 
-
-def _clearest(frames: list[Frame]) -> frozenset[str]:
-    """Return the arrays whose samples stay: the clearest ones of those that have any."""
-    clearest = Clearest()
-    for frame in frames:
-        if frame.samples.size:
+    They are chosen as the passes choose the arrays that they locate an event from: while the sound goes on.
+    """
+    clearest, kept = Clearest(), frozenset[str]()
+    previous = rows[0][0]
+    for frame_index, frames in rows:
+        if frame_index > previous + 1:
+            break
+        previous = frame_index
+        for frame in frames:
             clearest.note(frame.array, frame.power, active=frame.active)
-    clearest.choose(KEPT_ARRAYS)
-    return clearest.chosen
+        clearest.choose(KEPT_ARRAYS)
+        kept |= clearest.chosen
+    return kept

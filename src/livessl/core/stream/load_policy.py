@@ -220,6 +220,6 @@ class Clearest:
 
 
 def _median(values: Iterable[float]) -> float:
-    """Return the upper median; 1 of nothing."""
+    """Return the upper median; 0 of nothing, with which the most powerful array is the clearest."""
     ascending = sorted(values)
-    return ascending[len(ascending) // 2] if ascending else 1.0
+    return ascending[len(ascending) // 2] if ascending else 0.0

@@ -85,10 +85,12 @@ class FinalReception:
 
     def forget(self, before: int) -> None:
         """Forget which frames have been seen before the frame index before which all results are final."""
-        known = self.known_until
-        if known is not None and known + 1 < before:
-            first = known + 1 if self.given_up is None else min(self.given_up[0], known + 1)
-            self.given_up = first, before
+        known, given_up = self.known_until, self.given_up
+        if known is None:  # it has sent nothing in this run, of which `before` is the first such frame index
+            self.given_up = (before if given_up is None else given_up[0], before)
+        elif known + 1 < before:
+            goes_on = given_up is not None and known + 1 < given_up[1]
+            self.given_up = (given_up[0] if given_up is not None and goes_on else known + 1, before)
         if self.seen:
             self.seen = {frame_index for frame_index in self.seen if frame_index >= before}
 

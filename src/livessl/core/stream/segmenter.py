@@ -23,7 +23,11 @@ event, its pre-roll and the way of a backfill request together."""
 
 WARM_UP_FRAMES: Final = 10
 """Number of frames held back at the start. The quietest of them is the first estimate of the background, without the
-first frame, in which a device may fade in."""
+first frame if the device fades in there."""
+
+FADE_IN: Final = 4.0
+"""Ratio of the powers of the first frame's halves at and above which a device fades in: a sound must be as much louder
+than the background to be found."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,8 +130,8 @@ class Segmenter:
         held, self._warm_up = self._warm_up or [], None
         levels = [self._background.changing_power(known.spectrum, known.power) for _, known in held]
         if held:
-            first = 1 if len(held) >= WARM_UP_FRAMES else 0
-            self._activity.prime(min(levels[first:]))
+            fades_in = len(held) > 1 and _fades_in(self._selected(held[0][0]))
+            self._activity.prime(min(levels[1:] if fades_in else levels))
         return [
             message
             for (cut, known), level in zip(held, levels, strict=True)
@@ -175,3 +179,9 @@ class Segmenter:
             drift_ppm=state.drift_ppm,
             clock=state.clock,
         )
+
+
+def _fades_in(samples: Float32Array) -> bool:
+    """Return whether the second half of a first frame (channels, n) is much louder than the first, or all is zero."""
+    half = samples.shape[1] // 2
+    return bool(FADE_IN * np.square(samples[:, :half]).sum() <= np.square(samples[:, half : 2 * half]).sum())

@@ -42,10 +42,11 @@ export const getStream = (url) => request(url, { signal: null });
 /** What a server or proxy says when it refuses a request: a sentence, or one for each fault of the request. */
 export async function refusal(response) {
   const type = response.headers.get("Content-Type") ?? "";
-  const detail = type.startsWith("application/json") ? (await response.json()).detail : "";
+  const body = type.startsWith("application/json") ? await response.json().catch(() => null) : null;
+  const detail = body?.detail ?? "";
   const text = type.startsWith("text/plain") ? (await response.text()).trim() : "";
-  const faults = Array.isArray(detail) ? detail.map(({ msg }) => msg.replace(/^Value error, /, "")) : [detail];
-  return text || faults.join("; ") || `the server answered ${response.status}`;
+  const faults = Array.isArray(detail) ? detail.map(({ msg }) => msg?.replace(/^Value error, /, "")) : [detail];
+  return text || faults.filter((fault) => typeof fault === "string" && fault).join("; ") || `the server answered ${response.status}`;
 }
 
 const send = (method, url, value, options = {}) =>
