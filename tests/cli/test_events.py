@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from cli.command_runs import Run, interrupted
+from livessl.client.retry import Patience
 from livessl.server.app import Server
 from messages import START_NS, event_message
 from publishing_lives import free_port
@@ -78,13 +79,15 @@ def test_server_that_is_away_is_waited_for(
     run: Run, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     waits: list[float] = []
+    usual = Patience.next_wait_s
 
-    def patient(_: object, seconds: float) -> None:
-        waits.append(seconds)
+    def hurried(patience: Patience, error: Exception) -> float:
+        waits.append(usual(patience, error))
         if len(waits) == 3:
             raise KeyboardInterrupt
+        return 0.0
 
-    monkeypatch.setattr("livessl.client.sync.threading.Event.wait", patient)
+    monkeypatch.setattr(Patience, "next_wait_s", hurried)
     with caplog.at_level(logging.WARNING):
         assert run("events", "--url", f"http://127.0.0.1:{free_port()}").code == 0
     assert len(waits) == 3
