@@ -219,5 +219,5 @@ class ArrayStates:
             "asked": fusion.asked.get(name, 0),
             "helped": fusion.helped.get(name, 0),
             "too_late": fusion.input.too_late.get(name, 0),
-            "shed": self._ingest.shed[name] + fusion.input.thinned.get(name, 0),
+            "shed": self._ingest.shed[name] + fusion.input.thinned[name],
         }

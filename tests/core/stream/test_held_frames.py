@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from livessl.core.stream.held_frames import FORCED_FRAMES, HEADER_BYTES, KEPT_ARRAYS, HeldFrames
+from livessl.core.stream.held_frames import CLEAREST_ARRAYS, FORCED_FRAMES, HEADER_BYTES, HeldFrames
 from livessl.core.types import FRAME_NS, Frame
 
 SAMPLES = 100
@@ -32,8 +32,8 @@ def with_samples(frames: list[Frame]) -> set[str]:
 
 def test_samples_of_the_clearest_arrays_of_each_sound_stay() -> None:
     held = HeldFrames(hold_bytes=round(20 * len(ARRAYS) * FRAME_BYTES))
-    push_sound(held, 100, ARRAYS[:KEPT_ARRAYS])
-    push_sound(held, 130, ARRAYS[-KEPT_ARRAYS:])
+    push_sound(held, 100, ARRAYS[:CLEAREST_ARRAYS])
+    push_sound(held, 130, ARRAYS[-CLEAREST_ARRAYS:])
     before = held.nbytes
     dropped = held.expire(0, None)
     assert dropped == dict.fromkeys(ARRAYS, 10)  # each in one of the sounds
@@ -41,8 +41,8 @@ def test_samples_of_the_clearest_arrays_of_each_sound_stay() -> None:
     assert held.forced_until is None
     first, second = held.pop_until(120), held.pop_until(200)
     assert (len(first), len(second)) == (80, 80)  # no frame is lost
-    assert with_samples(first) == set(ARRAYS[:KEPT_ARRAYS])
-    assert with_samples(second) == set(ARRAYS[-KEPT_ARRAYS:])
+    assert with_samples(first) == set(ARRAYS[:CLEAREST_ARRAYS])
+    assert with_samples(second) == set(ARRAYS[-CLEAREST_ARRAYS:])
     assert held.nbytes == 0
 
 
@@ -86,31 +86,33 @@ def frames_at(held: HeldFrames, frame_indices: range, arrays: list[str], power: 
 def test_arrays_that_stay_are_the_same_when_samples_are_dropped_again() -> None:
     """Others become clearer while the sound goes on; nobody has the beginning of it then but those that were kept."""
     held = HeldFrames(hold_bytes=20 * len(ARRAYS) * FRAME_BYTES)
-    for first, clearest in ((100, ARRAYS[:KEPT_ARRAYS]), (120, ARRAYS[KEPT_ARRAYS:])):
+    for first, clearest in ((100, ARRAYS[:CLEAREST_ARRAYS]), (120, ARRAYS[CLEAREST_ARRAYS:])):
         frames_at(held, range(first, first + 20), clearest, 1e-1)
         frames_at(held, range(first, first + 20), [a for a in ARRAYS if a not in clearest], 1e-4)
         assert held.expire(0, None)
     frames = held.pop_until(200)
-    assert {f.frame_index for f in frames if f.samples.size and f.array in ARRAYS[:KEPT_ARRAYS]} == set(range(100, 140))
+    assert {f.frame_index for f in frames if f.samples.size and f.array in ARRAYS[:CLEAREST_ARRAYS]} == set(
+        range(100, 140)
+    )
 
 
 def test_array_that_becomes_clearer_is_kept_besides_the_first_ones() -> None:
     held = HeldFrames(hold_bytes=2 * 20 * len(ARRAYS) * FRAME_BYTES)
     frames_at(held, range(98, 100), ARRAYS, 1e-7)
-    louder = ARRAYS[KEPT_ARRAYS : KEPT_ARRAYS + 1]
-    for first, clearest, power in ((100, ARRAYS[:KEPT_ARRAYS], 1e-2), (120, louder, 1e-1)):
+    louder = ARRAYS[CLEAREST_ARRAYS : CLEAREST_ARRAYS + 1]
+    for first, clearest, power in ((100, ARRAYS[:CLEAREST_ARRAYS], 1e-2), (120, louder, 1e-1)):
         frames_at(held, range(first, first + 20), clearest, power)
         frames_at(held, range(first, first + 20), [a for a in ARRAYS if a not in clearest], 1e-4)
     assert held.expire(0, None)
-    assert with_samples(held.pop_until(200)) == set(ARRAYS[: KEPT_ARRAYS + 1])
+    assert with_samples(held.pop_until(200)) == set(ARRAYS[: CLEAREST_ARRAYS + 1])
 
 
 def test_without_a_quiet_frame_the_most_powerful_arrays_are_the_clearest() -> None:
     held = HeldFrames(hold_bytes=20 * len(ARRAYS) * FRAME_BYTES)
-    frames_at(held, range(100, 120), ARRAYS[:KEPT_ARRAYS], 1e-5)
-    frames_at(held, range(100, 120), ARRAYS[KEPT_ARRAYS:], 1e-2)
+    frames_at(held, range(100, 120), ARRAYS[:CLEAREST_ARRAYS], 1e-5)
+    frames_at(held, range(100, 120), ARRAYS[CLEAREST_ARRAYS:], 1e-2)
     assert held.expire(0, None)
-    assert with_samples(held.pop_until(200)) == set(ARRAYS[KEPT_ARRAYS:])
+    assert with_samples(held.pop_until(200)) == set(ARRAYS[CLEAREST_ARRAYS:])
 
 
 def test_nothing_is_given_up_that_has_not_come() -> None:

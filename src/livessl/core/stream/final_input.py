@@ -6,6 +6,7 @@ ahead; the final pass learns that number from its events, and so it is asked for
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable
 from functools import reduce
 
@@ -49,7 +50,7 @@ class FinalInput:
         """Number of frames of each array that came as backlog."""
         self.too_late = dict.fromkeys(self._receptions, 0)
         """Number of new frames of each array that came after the results of their time were final."""
-        self.thinned = dict.fromkeys(self._receptions, 0)
+        self.thinned = Counter[str]()
         """Number of frames of each array whose samples were dropped, because too many frames were held."""
         self.start_over()
 
@@ -116,9 +117,7 @@ class FinalInput:
         Arrays that are away are awaited until the frames of the others are overdue. `position` is the frame index up to
         which the final pass has gone.
         """
-        dropped = self.held.expire(now_ns, position, shedding=self._state.relief.arrays is not None)
-        for name, frames in dropped.items():
-            self.thinned[name] += frames
+        self.thinned.update(self.held.expire(now_ns, position, shedding=self._state.relief.arrays is not None))
         connected: list[int | None] = []
         away: list[int | None] = []
         for name, reception in self._receptions.items():

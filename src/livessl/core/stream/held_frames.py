@@ -37,7 +37,7 @@ THINNED_FROM: Final = 0.75
 THINNED_EVERY: Final = 0.125
 """Share of the memory that must have come since samples were dropped, before that is tried again."""
 
-KEPT_ARRAYS: Final = 4
+CLEAREST_ARRAYS: Final = 4
 """Arrays of each sound whose samples stay when memory gets short: the clearest, as many as an overloaded server locates
 a sound from (`load_policy.LEVELS`). An array that becomes clearer while the sound goes on is kept besides them."""
 
@@ -187,6 +187,6 @@ def _clearest(rows: Sequence[tuple[int, list[Frame]]]) -> frozenset[str]:
         previous = frame_index
         for frame in frames:
             clearest.note(frame.array, frame.power, active=frame.active)
-        clearest.choose(KEPT_ARRAYS)
+        clearest.choose(CLEAREST_ARRAYS)
         kept |= clearest.chosen
     return kept
