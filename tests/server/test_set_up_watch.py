@@ -17,11 +17,11 @@ from livessl.core.commission.blind_spot import BlindSpot
 from livessl.core.commission.finding import LEAST_SOUNDS, Finding, Severity
 from livessl.core.commission.steady import MOST_CONFIRMING
 from livessl.core.types import Observation
-from livessl.server import heard_sounds, set_up_watch
+from livessl.server import heard_sounds
 from livessl.server.overload import Overload
 from livessl.server.set_up_watch import KEPT_SOUNDS, SetUpWatch
 from livessl.site.build import set_up
-from small_site import HANG_S, site_of
+from small_site import site_of
 
 TURNED = Finding("turned", "south", None, Severity.ERROR, 0.9, "'south' is turned", "turn it back")
 CONTRADICTION = Finding("moved", None, None, Severity.ERROR, 0.5, "the arrays contradict each other", "clap")
@@ -217,25 +217,15 @@ def test_reader_never_sees_the_findings_of_one_state_with_the_sounds_of_another(
     assert torn == []
 
 
-def test_a_server_that_stops_does_not_wait_for_an_examination_to_end(
-    desk: Desk, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    reached, release = threading.Event(), threading.Event()
-
-    def examine() -> None:
-        reached.set()
-        release.wait()
-
-    monkeypatch.setattr(set_up_watch, "WAIT_S", 0.01)
-    monkeypatch.setattr(set_up_watch, "JOIN_S", 0.05)
-    monkeypatch.setattr(desk.watch, "examine", examine)
-    desk.watch.start()
-    try:
-        assert reached.wait(HANG_S)
-        desk.watch.stop()
-        (thread,) = [one for one in threading.enumerate() if one.name == "set-up"]
-        assert thread.daemon
-    finally:
-        release.set()
-    thread.join(HANG_S)
-    assert not thread.is_alive()
+def test_examination_is_urgent_while_a_finding_waits_to_be_confirmed_or_withdrawn(desk: Desk) -> None:
+    desk.hear([], LEAST_SOUNDS)
+    assert not desk.watch.is_urgent
+    desk.hear([TURNED])
+    assert desk.watch.is_urgent
+    desk.hear([TURNED])
+    assert desk.watch.state.findings == (TURNED,)
+    assert not desk.watch.is_urgent
+    desk.hear([])
+    assert desk.watch.is_urgent
+    desk.hear([], MOST_CONFIRMING)
+    assert (desk.watch.state.findings, desk.watch.is_urgent) == ((), False)

@@ -141,8 +141,8 @@ class Server:
             self._listener.close()
             # what computes at leisure comes last: what has to be on the disk does not wait for it
             self.parts.maps.stop()
-            self.parts.set_up_watch.stop()
-            self.parts.refiner.stop()
+            self.parts.set_up_watch.thread.stop()
+            self.parts.refiner.thread.stop()
         if self.parts.failure is not None:
             raise self.parts.failure
 
@@ -172,8 +172,8 @@ class Server:
         restore_alerts(self.parts)
         self.parts.receiver.start()
         self.parts.maps.start()
-        self.parts.set_up_watch.start()
-        self.parts.refiner.start()
+        self.parts.set_up_watch.thread.start()
+        self.parts.refiner.thread.start()
         self.parts.alerts.start()
         if self.parts.clips is not None:
             self.parts.clips.start()

@@ -78,7 +78,7 @@ class Parts:
     def failure(self) -> BaseException | None:
         """The error that has ended one of the threads, if any has ended."""
         parts = (
-            *(self.engine, self.receiver, self.maps, self.set_up_watch, self.refiner),
+            *(self.engine, self.receiver, self.maps, self.set_up_watch.thread, self.refiner.thread),
             *(self.alerts, self.clips, self.store.backlog, self.reloader, self.hub_link),
         )
         failures = (thread.failure for thread in parts if thread is not None)

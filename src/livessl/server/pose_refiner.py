@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import threading
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -13,16 +12,17 @@ from livessl.server.heard_sounds import HeardSounds
 from livessl.server.overload import Overload
 from livessl.server.proposals import Proposal, Proposals, shared_sounds
 from livessl.server.set_up_in_force import SetUpInForce
+from livessl.server.spare_time import SpareTimeThread
 from livessl.site.models import Site
 
 if TYPE_CHECKING:
     from livessl.core.commission.resection import MeasuredPose
 
 WAIT_S: Final = 2.0
-"""Interval, in seconds, at which the thread looks for new sounds, and at which it can be stopped."""
+"""Interval, in seconds, at which the thread looks for new sounds."""
 
-JOIN_S: Final = 1.0
-"""Longest wait, in seconds, for a refinement that is under way when the server stops; it is of no use any more."""
+SHARE: Final = 0.05
+"""Greatest share of one core's time that refinements take. Poses that are off are no matter of seconds."""
 
 REFINED_SOUNDS: Final = 20
 """Fewest sounds from which the thread refines: fewer leave poses unsure."""
@@ -77,25 +77,13 @@ class PoseRefiner:
         self._proposals = proposals
         self._set_up = set_up
         self._heard = heard
-        self._overload = overload
         self._refined: tuple[Site, int] | None = None  # the site and the last sound of the last refinement
         self.refinement = Refinement()
         """The latest refinement. Read it once for values that belong together."""
-        self._stop = threading.Event()
-        self._thread: threading.Thread | None = None
-        self.failure: BaseException | None = None
-        """The error that has ended the thread, if one has."""
-
-    def start(self) -> None:
-        """Begin to refine."""
-        self._thread = threading.Thread(target=self._work, name="refine", daemon=True)
-        self._thread.start()
-
-    def stop(self) -> None:
-        """Stop, and wait a little for the thread."""
-        self._stop.set()
-        if self._thread is not None:
-            self._thread.join(timeout=JOIN_S)
+        self.thread = SpareTimeThread(
+            "refine", self.refine_if_new, overload, wait_s=WAIT_S, share=SHARE, what="the refinement of the poses"
+        )
+        """Calls `refine_if_new`."""
 
     def refine_if_new(self) -> None:
         """Refine if there are enough new sounds or other poses; the thread calls it, and a test may."""
@@ -121,16 +109,6 @@ class PoseRefiner:
             self.refinement = Refinement(len(sounds), proposal, agrees=False)
         else:
             self.refinement = Refinement(len(sounds), None, agrees=True)
-
-    def _work(self) -> None:
-        try:
-            while not self._stop.wait(WAIT_S):
-                if self._overload.message is None:
-                    self.refine_if_new()
-        except BaseException as error:
-            self.failure = error
-            _log.exception("the refinement of the poses has failed; the server ends")
-            raise
 
 
 def _best_known(site: Site) -> str:

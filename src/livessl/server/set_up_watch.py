@@ -20,6 +20,7 @@ from livessl.core.commission.steady import SteadyFindings
 from livessl.core.types import Event, Observation
 from livessl.server.heard_sounds import HeardSounds
 from livessl.server.overload import Overload
+from livessl.server.spare_time import SpareTimeThread
 from livessl.site.build.layout import layout_findings
 from livessl.site.models import Site
 
@@ -27,10 +28,10 @@ KEPT_SOUNDS: Final = 12
 """Number of sounds that are examined together: ten show most faults."""
 
 WAIT_S: Final = 1.0
-"""Interval, in seconds, at which the thread looks for new sounds, and at which it can be stopped."""
+"""Interval, in seconds, at which the thread looks for new sounds."""
 
-JOIN_S: Final = 1.0
-"""Longest wait, in seconds, for an examination that is under way when the server stops."""
+SHARE: Final = 0.1
+"""Greatest share of one core's time that examinations take. Where sounds come fast, several are examined at a time."""
 
 _log = logging.getLogger(__name__)
 
@@ -81,7 +82,6 @@ class SetUpWatch:
 
     def __init__(self, site: Site, overload: Overload, first_sound: int = 0) -> None:
         self._site = site
-        self._overload = overload
         self._lock = threading.Lock()
         self.heard = HeardSounds(first_sound)
         """The last sounds, for calibration."""
@@ -98,10 +98,21 @@ class SetUpWatch:
         self._clocks_off: frozenset[str] = frozenset()  # arrays
         self.state = SetUpState(findings=self._of_layout)
         """The latest state. Read it once for values that belong together."""
-        self._stop = threading.Event()
-        self._thread: threading.Thread | None = None
-        self.failure: BaseException | None = None
-        """The error that has ended the thread, if one has."""
+        self.thread = SpareTimeThread(
+            "set-up",
+            self.examine,
+            overload,
+            wait_s=WAIT_S,
+            share=SHARE,
+            what="the examination of the set-up",
+            is_urgent=lambda: self.is_urgent,
+        )
+        """Calls `examine`, sooner while a finding waits to be confirmed."""
+
+    @property
+    def is_urgent(self) -> bool:
+        """True while the next sounds decide whether a finding is published, or ends."""
+        return self._steady.is_doubtful
 
     def finding_of(self, array: str) -> str | None:
         """Return the error that concerns an array, in words; None if there is none."""
@@ -159,17 +170,6 @@ class SetUpWatch:
             self._unjudged = len(self._sounds)
             self._note(())
 
-    def start(self) -> None:
-        """Begin to examine."""
-        self._thread = threading.Thread(target=self._work, name="set-up", daemon=True)
-        self._thread.start()
-
-    def stop(self) -> None:
-        """Stop, and wait a little for the thread."""
-        self._stop.set()
-        if self._thread is not None:
-            self._thread.join(timeout=JOIN_S)
-
     def examine(self) -> None:
         """Examine the sounds if there are new ones; the thread calls it, and a test may."""
         with self._lock:
@@ -226,16 +226,6 @@ class SetUpWatch:
         for finding in findings:
             if _subject(finding) not in before:
                 _log.warning("%s; %s", finding.message, finding.cure)
-
-    def _work(self) -> None:
-        try:
-            while not self._stop.wait(WAIT_S):
-                if self._overload.message is None:
-                    self.examine()
-        except BaseException as error:
-            self.failure = error
-            _log.exception("the examination of the set-up has failed; the server ends")
-            raise
 
 
 def _subject(finding: Finding) -> tuple[str, str | None, int | None]:

@@ -61,6 +61,11 @@ class _Question:
         """True if something is published, or may soon be."""
         return bool(self.published or self.rival)
 
+    @property
+    def is_contested(self) -> bool:
+        """True if the latest answer is another than the published one."""
+        return self.rival_support > 0
+
 
 class SteadyFindings:
     """Decides which findings are published while examinations follow each other, each with some more sounds.
@@ -73,6 +78,11 @@ class SteadyFindings:
 
     def __init__(self) -> None:
         self._questions: dict[Hashable, _Question] = {}
+
+    @property
+    def is_doubtful(self) -> bool:
+        """True if the latest answer to a question is another than what is published: the next sounds decide."""
+        return any(state.is_contested for state in self._questions.values())
 
     def note(self, findings: Iterable[Finding], sounds: int) -> tuple[Finding, ...]:
         """Take in the findings of an examination, and return what is published, errors first.

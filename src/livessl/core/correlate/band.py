@@ -72,6 +72,12 @@ def dead_channels(segments: Sequence[Float32Array]) -> BoolArray:
     Channels are compared with the second loudest, because the loudest may be broken and crackle. In silence, and with
     sound on one channel alone, none is called dead. A constant offset does not count as sound.
     """
-    centred = [each - each.mean(axis=1, keepdims=True) for each in segments]  # the difference of squares would cancel
-    power = np.sum([np.einsum("kn,kn->k", each, each) for each in centred], axis=0, dtype=np.float64)
+    power = np.sum([_centred_power(each) for each in segments], axis=0)
     return np.asarray(power < DEAD * np.sort(power)[-2])
+
+
+def _centred_power(samples: Float32Array) -> FloatArray:
+    """Return the power (K,) of the samples (K, n) around their means; the difference of squares would cancel."""
+    count = samples.shape[1]
+    means = samples @ np.full(count, 1.0 / max(count, 1), dtype=np.float32)
+    return np.array([np.vdot(row, row) for row in samples - means[:, None]], dtype=np.float64)

@@ -127,18 +127,19 @@ class Onset(MapEstimator):
         If there is no second source and the first answer is not sure, a sound that has ended gets a second look: whole
         segments are added to the onsets, and the more confident of the two answers is returned. A sound that a place
         outside the search volume explains better is reported as such (`livessl.core.locate.outside`). Neither whole
-        segments nor clocks that are apart inside an array are considered unless every sound allows `second_looks`.
+        segments nor clocks that are apart inside an array are considered unless every sound has ended, and allows
+        `second_looks`.
         """
         strongest = strongest_onsets(sounds, MOST_ARRAYS)
         looks_again = all(sound.second_looks for sound in strongest.values())
-        looks_at_whole = looks_again and all(sound.ended for sound in strongest.values())
+        is_thorough = looks_again and all(sound.ended for sound in strongest.values())
         evidence = self.evidence(strongest)
         suspect = [name for name, sound in strongest.items() if sound.suspect]
-        evidence, answer = self._beneath_background(evidence, suspect, tolerance=looks_again)
+        evidence, answer = self._beneath_background(evidence, suspect, tolerance=is_thorough)
         if looks_again and not answer.is_sure:
             loud = self._loud(evidence, strongest)
             if loud is not None:
-                _, by_loud = self._beneath_background(loud, suspect, tolerance=True)
+                _, by_loud = self._beneath_background(loud, suspect, tolerance=is_thorough)
                 answer = max(answer, by_loud, key=_Answer.rank)
         outside = self._outside(answer)
         separation = None
@@ -154,7 +155,7 @@ class Onset(MapEstimator):
             outside = None
             second = self._with_candidates(second)
             others = (replace(second, unneeded=sounds.keys() - {part.spec.name for part in second.evidence}),)
-        elif outside is None and looks_at_whole and not answer.is_sure:
+        elif outside is None and is_thorough and not answer.is_sure:
             second_look = self._answer(self._with_whole_segments(evidence, strongest), suspect, whole=True)
             answer = max(answer, second_look, key=_Answer.rank)
             outside = self._outside(answer)

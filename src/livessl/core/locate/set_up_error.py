@@ -19,7 +19,7 @@ import scipy
 
 from livessl.core.correlate.gcc_phat import mean_square_angular_frequency
 from livessl.core.geometry import microphone_pairs, pair_weight
-from livessl.core.types import ArraySpec, FloatArray
+from livessl.core.types import ArraySpec, FloatArray, IntArray
 
 _DELAY_M: Final = 0.003
 """Error of the delays, in metres of path, with which their information is compared with that of the distance: without
@@ -50,21 +50,22 @@ def set_up_covariance_m2(arrays: Sequence[ArraySpec], position_m: FloatArray, ax
     """
     distances_m = [float(np.linalg.norm(position_m - spec.centre_m)) for spec in arrays]
     unknown_m = max(*distances_m, *(spec.aperture_m for spec in arrays))
-    information, spread, by_speed = np.eye(3) / unknown_m**2, np.zeros((3, 3)), np.zeros(3)
+    counts = np.array([len(spec.microphones_m) for spec in arrays])
+    from_m = position_m - np.concatenate([spec.microphones_m for spec in arrays])
+    distance_m = np.maximum(np.linalg.norm(from_m, axis=1), 1e-3)
+    toward = from_m / distance_m[:, None]
+    pairs = [microphone_pairs(count) + begin for count, begin in zip(counts, _begins(counts), strict=True)]
+    first, second = np.concatenate(pairs).T
     bandwidths = np.array([mean_square_angular_frequency(spec.band_hz) for spec in arrays])
-    for spec, share in zip(arrays, bandwidths / bandwidths.mean(), strict=True):
-        from_m = position_m - spec.microphones_m
-        distance_m = np.maximum(np.linalg.norm(from_m, axis=1), 1e-3)
-        toward = from_m / distance_m[:, None]
-        first, second = microphone_pairs(len(distance_m)).T
-        slopes = toward[second] - toward[first]
-        weighted = pair_weight(len(distance_m)) * share / _DELAY_M**2 * slopes
-        information += weighted.T @ slopes
-        by_speed += weighted.T @ (distance_m[second] - distance_m[first])
-        pulls = np.zeros_like(toward)  # sum over the pairs of a microphone, with its sign in each
-        np.add.at(pulls, second, weighted)
-        np.subtract.at(pulls, first, weighted)
-        spread += _by_frames(spec, pulls[:, :, None] * toward[:, None, :])
+    weights = bandwidths / bandwidths.mean() / _DELAY_M**2 * [pair_weight(count) for count in counts]
+    slopes = toward[second] - toward[first]
+    weighted = np.repeat(weights, [len(own) for own in pairs])[:, None] * slopes
+    information = np.eye(3) / unknown_m**2 + weighted.T @ slopes
+    by_speed = weighted.T @ (distance_m[second] - distance_m[first])
+    pulls = np.zeros_like(toward)  # sum over the pairs of a microphone, with its sign in each
+    np.add.at(pulls, second, weighted)
+    np.subtract.at(pulls, first, weighted)
+    spread = _by_frames(arrays, pulls[:, :, None] * toward[:, None, :])
     speed_share = max(spec.uncertainty.temperature_c for spec in arrays) / (2.0 * _KELVIN)
     spread += speed_share**2 * np.outer(by_speed, by_speed)
     free = np.ix_(list(axes), list(axes))
@@ -107,14 +108,23 @@ def _directions() -> FloatArray:
     return np.stack([around * np.cos(angle), around * np.sin(angle), height], axis=1)
 
 
-def _by_frames(spec: ArraySpec, pulls: FloatArray) -> FloatArray:
-    """Return what shifts and turns of an array's frames add to the spread (3, 3); `pulls` (K, 3, 3) of microphones."""
-    known, spread, begin = spec.uncertainty, np.zeros((3, 3)), 0
-    for count in spec.parts or (len(pulls),):
-        own = slice(begin, begin + count)
-        arm_m = spec.microphones_m[own] - spec.microphones_m[own].mean(axis=0)
-        shift = pulls[own].sum(axis=0)
-        turn = np.einsum("mab,mbc->ac", pulls[own], np.cross(np.eye(3)[None], arm_m[:, None, :]).swapaxes(1, 2))
-        spread += known.position_m**2 * shift @ shift.T + np.radians(known.orientation_deg) ** 2 * turn @ turn.T
-        begin += count
-    return spread
+def _by_frames(arrays: Sequence[ArraySpec], pulls: FloatArray) -> FloatArray:
+    """Return the spread (3, 3) by shifts and turns of the arrays' frames; `pulls` (K, 3, 3) of all microphones."""
+    frames = [spec.parts or (len(spec.microphones_m),) for spec in arrays]  # microphones of each frame
+    counts = np.array([count for own in frames for count in own])
+    begins, microphones_m = _begins(counts), np.concatenate([spec.microphones_m for spec in arrays])
+    centres_m = np.add.reduceat(microphones_m, begins) / counts[:, None]
+    x, y, z = (microphones_m - np.repeat(centres_m, counts, axis=0)).T
+    zero = np.zeros_like(x)
+    turned = np.array([[zero, z, -y], [-z, zero, x], [y, -x, zero]]).transpose(2, 0, 1)  # (K, 3, 3), by unit turns
+    shifts, turns = np.add.reduceat(pulls, begins), np.add.reduceat(pulls @ turned, begins)
+    known = [spec.uncertainty for spec, own in zip(arrays, frames, strict=True) for _ in own]
+    shifts *= np.array([one.position_m for one in known])[:, None, None]
+    turns *= np.radians([one.orientation_deg for one in known])[:, None, None]
+    both = np.concatenate([shifts, turns])
+    return np.asarray(np.einsum("fab,fcb->ac", both, both))
+
+
+def _begins(counts: IntArray) -> IntArray:
+    """Return where each of several runs begins that follow one another, of these lengths."""
+    return np.asarray(np.cumsum(counts) - counts)
