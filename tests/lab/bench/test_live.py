@@ -111,7 +111,7 @@ def test_a_tiny_run_reports_every_number(capsys: pytest.CaptureFixture[str]) -> 
     assert shown["updates_due"] >= 20
     assert shown["updates"] > 0
     assert shown["events"] >= 1
-    assert shown["pictures"] > 1
+    assert shown["pictures"] >= 1  # an overloaded server draws no more
     assert 0 < shown["latency_ms"]["p50"] <= shown["latency_ms"]["p95"] <= shown["latency_ms"]["max"]
     assert set(shown["stages_ms"]) == {"load", "sent", "received", "located", "delivered"}
     assert shown["cpu_percent"] > 0
