@@ -8,7 +8,7 @@ pairs upside down.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -35,7 +35,7 @@ LEAST_SHARPNESS: Final = 3.5
 
 def receive(evidence: Evidence, segments: Iterable[Float32Array]) -> Received:
     """Keep what `observe` needs of an array's evidence and of its samples, segments of (K, n)."""
-    return Received(evidence, _powers(segments))
+    return Received(replace(evidence, background=None, beginning=None), _powers(segments))
 
 
 def observe(received: Iterable[Received]) -> tuple[Observation, ...]:
