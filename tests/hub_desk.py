@@ -116,8 +116,7 @@ def running_hub(hub: Hub, service: ServiceManager | None = None) -> Iterator[Hub
 
 def newest_at(url: str, site: str) -> str | None:
     """The id of a site's newest event at a hub; None if there is none."""
-    answer = httpx.get(f"{url}/api/v1/events", params={"site": site, "limit": 1}, timeout=HANG_S).raise_for_status()
-    return next((str(event["id"]) for event in answer.json()["events"]), None)
+    return next((str(event["id"]) for event in _page(url, {"site": site, "limit": 1})["events"]), None)
 
 
 def ids_at(url: str, site: str) -> list[str]:
@@ -125,9 +124,17 @@ def ids_at(url: str, site: str) -> list[str]:
     found: list[str] = []
     cursor: str | None = None
     while True:
-        asked: dict[str, str | int] = {"site": site, "limit": 1000, **({} if cursor is None else {"cursor": cursor})}
-        page = httpx.get(f"{url}/api/v1/events", params=asked, timeout=HANG_S).raise_for_status().json()
+        page = _page(url, {"site": site, "limit": 1000, **({} if cursor is None else {"cursor": cursor})})
         found += [event["id"] for event in page["events"]]
         cursor = page["next_cursor"]
         if cursor is None:
             return found[::-1]
+
+
+def _page(url: str, query: dict[str, str | int]) -> JsonObject:
+    """One page of a site's events; an empty one while the hub does not know the site."""
+    answer = httpx.get(f"{url}/api/v1/events", params=query, timeout=HANG_S)
+    if answer.status_code == 404:
+        return {"events": [], "next_cursor": None}
+    page: JsonObject = answer.raise_for_status().json()
+    return page

@@ -63,6 +63,9 @@ def test_what_was_found_before_a_hub_existed_arrives_once_it_does(nats: NatsServ
         SiteArrays.model_validate(httpx.get(f"{hub.url}/api/v1/arrays").json())
         assert httpx.get(f"{hub.url}/api/v1/sites/lab.1/events/none").status_code == 404
         assert httpx.get(f"{hub.url}/api/v1/events?sit=lab").status_code == 422
+        assert httpx.get(f"{hub.url}/api/v1/alerts?site=lab.1").json()["alerts"] == []  # known, and without any
+        refused = httpx.get(f"{hub.url}/api/v1/events?site=lab1")
+        assert (refused.status_code, "did you mean 'lab.1'?" in refused.json()["detail"]) == (404, True)
         metrics = httpx.get(f"{hub.url}/metrics").text
         assert 'livessl_site_up{site="lab.1"} 1.0' in metrics
         assert "livessl hub" in httpx.get(hub.url).text

@@ -241,6 +241,18 @@ class Archive:
             states = _array_states(connection, silent) if silent else {}
         return [describe(contact, contact.states or states.get(contact.site, {})) for contact in contacts]
 
+    def has_site(self, name: str) -> bool:
+        """Return whether a message or a report of the site has ever come."""
+        if "\0" in name:  # PostgreSQL cannot compare it
+            return False
+        with self._database.reading() as connection:
+            return connection.execute(select(sites.c.site).where(sites.c.site == name)).scalar() is not None
+
+    def site_names(self) -> list[str]:
+        """Return the names of all sites, in order."""
+        with self._database.reading() as connection:
+            return list(connection.execute(select(sites.c.site).order_by(sites.c.site)).scalars())
+
     def contacts(self) -> list[Contact]:
         """Return all sites, by name, without the messages about their arrays."""
         with self._database.reading() as connection:

@@ -6,7 +6,6 @@ import json
 from collections.abc import Callable, Mapping
 from fractions import Fraction
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Final
 
 import numpy as np
@@ -18,6 +17,7 @@ from livessl.errors import ConfigError
 from livessl.recordings.session import SESSION_FILE, SITE_FILE, holds_copied_site, piece, read_session, write_session
 from livessl.simulation.of_site import rendered
 from livessl.simulation.scene import Scene, truth
+from livessl.simulation.unfinished import unfinished_folder
 from livessl.site.models import Site
 
 TRUTH_FILE: Final = "truth.jsonl"
@@ -35,7 +35,7 @@ def scene_files(directory: Path, site: Site) -> list[Path]:
 def simulated_files(directory: Path) -> frozenset[Path]:
     """Return the files of the simulated session in a folder; none if there is no such session.
 
-    A site file that somebody has written is none of them: it has comments, or another layout than a session's copy.
+    A site file that a person has written is none of them: it has comments, or another layout than a session's copy.
     """
     try:
         session = read_session(directory)
@@ -61,7 +61,7 @@ def write_scene(
     """Render a scene for every array of a site into a folder: `ARRAY.wav` (16 bit), `truth.jsonl`, and a session.
 
     A simulated session that is there is replaced with all its files once the new one is complete, and stays as it is if
-    that fails or is interrupted.
+    that fails or is interrupted. What runs that were killed have left in the folder is removed.
 
     Parameters
     ----------
@@ -81,9 +81,14 @@ def write_scene(
         If the folder cannot be written.
     """
     directory.mkdir(parents=True, exist_ok=True)
-    with TemporaryDirectory(prefix="unfinished-", dir=directory) as unfinished:
-        _write(Path(unfinished), site, scene, seed, rates_hz or {}, progress)
-        _take_place(Path(unfinished), directory)
+    with unfinished_folder(directory, _is_own) as unfinished:
+        _write(unfinished, site, scene, seed, rates_hz or {}, progress)
+        _take_place(unfinished, directory)
+
+
+def _is_own(name: str) -> bool:
+    name = name.removesuffix(".part")
+    return name in (TRUTH_FILE, SESSION_FILE, SITE_FILE) or name.endswith(".wav")
 
 
 def _write(

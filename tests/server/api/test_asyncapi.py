@@ -63,6 +63,12 @@ def test_server_is_the_one_that_was_asked(server: Server, described: dict[str, A
     assert "security" not in here
 
 
+def test_unknown_query_parameter_is_refused(server: Server) -> None:
+    answer = httpx.get(f"{server.url}{PATH}?form=yaml")
+    assert answer.status_code == 422
+    assert answer.json()["detail"][0]["loc"] == ["query", "form"]
+
+
 def test_every_kind_of_message_is_described(described: dict[str, Any]) -> None:
     live = described["channels"]["live"]
     assert live["address"] == "/api/v1/live"

@@ -111,7 +111,16 @@ def test_what_does_not_exist_is_answered_with_404(server_url: str, method: str, 
     refused(httpx.request(method, f"{server_url}/api/v1/{path}", json=body))
 
 
-@pytest.mark.parametrize("path", ["sites/none/events/none", "sites/no%00ne/events/none", "sites/none", "none"])
+@pytest.mark.parametrize(
+    "path",
+    [
+        "sites/none/events/none",
+        "sites/no%00ne/events/none",
+        "sites/none",
+        *(f"{name}?site=none" for name in ("arrays", "tracks", "alerts", "events")),
+        "none",
+    ],
+)
 def test_what_a_hub_does_not_know_is_answered_with_404(hub_url: str, path: str) -> None:
     refused(httpx.get(f"{hub_url}/api/v1/{path}"))
 

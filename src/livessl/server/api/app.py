@@ -91,7 +91,7 @@ def create_app(parts: Parts, access: Access) -> FastAPI:
         app.include_router(router, dependencies=strict, responses=errors(422))
     app.include_router(metrics_route(parts))
     app.include_router(live_routes(parts, names))
-    app.include_router(asyncapi_route(site, access))
+    app.include_router(asyncapi_route(site, access), dependencies=strict)
     documentation.add_documentation(app)
 
     app.add_exception_handler(StoreError, _without_database)
