@@ -331,7 +331,7 @@ class EndsAfterTheFirstBatch(Event):
 
 
 def test_deletion_ends_when_the_server_does(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("livessl.server.store.EXPIRED_AT_ONCE", 3)
+    monkeypatch.setattr("livessl.server.history.deletion.DELETED_AT_ONCE", 3)
     fill(store, 10)
     end = EndsAfterTheFirstBatch()
     assert store.expire(START_NS + 7 * NS, end) == 3
@@ -343,8 +343,8 @@ def test_deletion_gives_way_to_events_that_are_to_be_stored(
     opened: Callable[[], Store], monkeypatch: pytest.MonkeyPatch, batches: int
 ) -> None:
     """Before every batch; otherwise each event would wait for a batch, and a busy store would fall behind."""
-    monkeypatch.setattr("livessl.server.store.GIVE_WAY_S", HANG_S)
-    monkeypatch.setattr("livessl.server.store.EXPIRED_AT_ONCE", 2)
+    monkeypatch.setattr("livessl.server.history.deletion.GIVE_WAY_S", HANG_S)
+    monkeypatch.setattr("livessl.server.history.deletion.DELETED_AT_ONCE", 2)
     store, done = opened(), list[str]()
     fill(store, 2 * batches)
     store.backlog.start()
@@ -380,7 +380,7 @@ def test_nothing_is_older_than_any_time_that_can_be_stored(store: Store) -> None
 
 
 def test_expired_events_are_gone_in_batches(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("livessl.server.store.EXPIRED_AT_ONCE", 3)
+    monkeypatch.setattr("livessl.server.history.deletion.DELETED_AT_ONCE", 3)
     fill(store, 10)
     assert store.expire(START_NS + 7 * NS) == 7
     assert (ids(store), ids(store, zone="door"), store.count()) == ([9, 8, 7], [9], 3)

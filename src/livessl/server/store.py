@@ -19,6 +19,8 @@ from livessl.server.forwarding.outbox import Outbox
 from livessl.server.history import records
 from livessl.server.history.backlog import Backlog
 from livessl.server.history.database import CURE, Database, StoreError
+from livessl.server.history.deletion import delete_older
+from livessl.server.history.event_count import EventCount
 from livessl.server.history.heat_map import Cells, HeatMap, count_by_cell
 from livessl.server.history.journal import (
     Entry,
@@ -27,7 +29,6 @@ from livessl.server.history.journal import (
     journal_page,
     keep_newest_entries,
     put_entry,
-    remove_older_entries,
 )
 from livessl.server.history.log import LogPage, LogPosition, log_page
 from livessl.server.history.query import Cursor, Page, Query, Row
@@ -44,18 +45,8 @@ JsonObject = dict[str, Any]
 MAX_EVENTS_IN_MEMORY: Final = 10_000
 """Most events kept in memory, about 10 MB, and most entries of the journal; a database on a disk has no such limit."""
 
-EXPIRED_AT_ONCE: Final = 200
-"""Old events that are deleted in one transaction: the longest that a new event waits for their deletion."""
-
-GIVE_WAY_S: Final = 2.0
-"""Longest wait, in seconds, of such a transaction for new events that are to be stored: each of these would wait for
-one, and a store that is busy with both would fall behind. A store that is behind all the time deletes slowly."""
-
 SCANNED_AT_ONCE: Final = 1000
 """Events that an export reads at a time."""
-
-PAUSE_S: Final = 0.01
-"""Pause, in seconds, between two of these transactions, in which what waits is written."""
 
 _log = logging.getLogger(__name__)
 
@@ -83,8 +74,7 @@ class Store:
 
     def __init__(self, place: Path | str | None = None, *, forwards: bool = False) -> None:
         self._bounded = place is None
-        self._count: int | None = None
-        self._counting = threading.Lock()
+        self._count = EventCount()
         self._when_ready: deque[Callable[[], None]] = deque()
         self._database = Database(place, (forwarding.prepare,) if forwards else ())
         self.outbox = Outbox(self._database) if forwards else None
@@ -129,7 +119,7 @@ class Store:
         """Make or migrate the tables, unless that is done, and do what waits for them."""
         if self._database.prepare():
             with suppress(StoreError):  # only the metrics want the number: nothing must wait for it
-                self._count_all()
+                self._count.take(self._database)
         while self._when_ready:
             self._when_ready[0]()
             self._when_ready.popleft()  # not before it is done: an error leaves it for the next time
@@ -146,7 +136,7 @@ class Store:
                 records.put_early(connection, event["id"])
             if self._bounded:
                 change -= records.keep_newest(connection, MAX_EVENTS_IN_MEMORY)
-        self._counted(change)
+        self._count.change(change)
 
     def add_all(self, given: Sequence[tuple[JsonObject, int]]) -> None:
         """Store many events, each with its start, all or nothing."""
@@ -154,7 +144,7 @@ class Store:
             change = records.put_events(connection, given)
             if self._bounded:
                 change -= records.keep_newest(connection, MAX_EVENTS_IN_MEMORY)
-        self._counted(change)
+        self._count.change(change)
 
     def finalize(
         self,
@@ -188,7 +178,7 @@ class Store:
             put_progress(connection, site, frame_index, clocks)
             if self.outbox is not None:
                 self.outbox.put_final_with(connection, events, kept)
-        self._counted(change)
+        self._count.change(change)
         if self.outbox is not None:
             self.outbox.wake()
 
@@ -215,28 +205,9 @@ class Store:
             return records.early_events(connection)
 
     def expire(self, before_ns: int, end: threading.Event | None = None) -> int:
-        """Delete the events and entries of before a time, and overwrite them in an SQLite file.
-
-        Returns the number of the events.
-
-        `end` ends it early, between two transactions; the next call does the rest.
-        """
-        gone, end = 0, threading.Event() if end is None else end
-        before_ns = max(before_ns, 0)  # a database has no number for a time long before 1970
-        while not end.is_set():
-            self.backlog.settle(GIVE_WAY_S)
-            with self._database.writing("delete old events") as connection:
-                some = records.remove_older(connection, before_ns, EXPIRED_AT_ONCE)
-                others = remove_older_entries(connection, before_ns, EXPIRED_AT_ONCE)
-                if self.outbox is not None:
-                    self.outbox.expire_with(connection, before_ns)
-            self._counted(-some)
-            gone += some
-            if max(some, others) < EXPIRED_AT_ONCE:
-                self._database.erase()
-                break
-            end.wait(PAUSE_S)
-        return gone
+        """Delete the events and entries of before a time; return the number of the events. See `delete_older`."""
+        end = threading.Event() if end is None else end
+        return delete_older(self._database, self.backlog, self.outbox, self._count, before_ns, end)
 
     def get(self, event_id: str) -> JsonObject | None:
         """Return the event of that id, None if there is none."""
@@ -295,21 +266,9 @@ class Store:
 
     def count(self) -> int | None:
         """Return the number of events; None if they could not be counted when the database was opened."""
-        with self._counting:
-            return self._count
+        return self._count.number
 
     def close(self) -> None:
         """Write what waits, and release the database."""
         self.backlog.stop()
         self._database.close()
-
-    def _count_all(self) -> None:
-        with self._database.reading() as connection:
-            count = records.count_events(connection)
-        with self._counting:
-            self._count = count
-
-    def _counted(self, change: int) -> None:
-        with self._counting:
-            if self._count is not None:
-                self._count += change
