@@ -267,7 +267,7 @@ def test_alerts_of_a_removed_action_are_dead_letters_that_can_be_dismissed(
         assert desk.alerts.problems == ["alerts.actions.guard: 1 alert was given up; see GET alerts/dead-letters"]
         [(letter, _)] = desk.alerts.outbox.dead(10)
         with pytest.raises(LookupError, match="'guard', which the site file does not have; add it"):
-            desk.alerts.resend(letter.number)
+            desk.alerts.dead_letters.resend(letter.number)
         desk.alerts.outbox.dismiss(letter.number)
         assert desk.alerts.problems == []
 

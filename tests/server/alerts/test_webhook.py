@@ -164,7 +164,7 @@ def test_dead_letter_after_the_last_attempt_can_be_sent_again(
         assert (dead.state, dead.error) == (DeliveryState.DEAD, f"answered {status}, expected 2xx")
         assert alert["key"] == key_of(sound(1))
         receiver.answer = lambda: (204, {})
-        desk.alerts.resend(dead.number)
+        desk.alerts.dead_letters.resend(dead.number)
         wait_until(lambda: states(desk) == {"delivered": 1}, "the delivery")
         assert desk.alerts.problems == []
 

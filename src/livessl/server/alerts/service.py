@@ -15,12 +15,15 @@ from typing import Final
 
 from livessl.core.types import FRAME_NS
 from livessl.errors import RunError
-from livessl.server.alerts.courier import NS_PER_S, Courier
+from livessl.server.alerts.courier import Courier
+from livessl.server.alerts.dead_letters import DeadLetters
 from livessl.server.alerts.event_order import EventOrder
 from livessl.server.alerts.evidence import Evidence
 from livessl.server.alerts.history import DryRuns
 from livessl.server.alerts.in_force import AlertsInForce, Surroundings, outbox_path
+from livessl.server.alerts.judge import Judge
 from livessl.server.alerts.outbox import DeliveryState, Outbox, OutboxError
+from livessl.server.alerts.retention import Retention
 from livessl.server.alerts.rules import RuleState
 from livessl.server.alerts.thread import AlertThread, TurnTooLongError
 from livessl.server.api.encode import JsonObject
@@ -29,11 +32,6 @@ from livessl.server.set_up_watch import SetUpWatch
 from livessl.server.site_time import SiteTime
 from livessl.site.alert_models import AlertsConfig
 from livessl.site.models import Site
-
-EXPIRE_NS: Final = 600 * NS_PER_S
-"""Interval, in nanoseconds, at which old alerts are deleted."""
-
-DAY_NS: Final = 86_400 * NS_PER_S
 
 TAKE_OVER_S: Final = 10.0
 """Longest wait, in seconds, for the thread when rules are replaced; it may be judging a long past."""
@@ -58,6 +56,12 @@ class Conditions:
     array_states: ArrayStates
     set_up_watch: SetUpWatch
     site_time: SiteTime
+
+    def judge(self, judge: Judge, now_ns: int) -> Sequence[JsonObject]:
+        """Return the alerts that rules raise at a time about the present arrays and findings; none during a replay."""
+        if self.site_time.is_replay:
+            return ()
+        return judge.judge_conditions(self.array_states.describe(levels=False), self.set_up_watch.state, now_ns)
 
 
 class Alerts:
@@ -99,11 +103,13 @@ class Alerts:
             site.site, around.clock, around.store, self._announce, around.traces,
             is_caught_up=not self._in_force.judges_events,
         )  # fmt: skip
-        self._expired_ns = 0
+        self._retention = Retention(site.store.retention_days)
         self._is_failing = False
         self._starting = threading.RLock()
         self._changing = threading.Lock()  # a rule is armed either before or after it is replaced
         self._thread = AlertThread(self._turn, lambda: self.couriers.values())
+        self.dead_letters = DeadLetters(lambda: self._in_force, around.clock, self._thread.wake_couriers)
+        """Deliveries that were given up."""
 
     # --- for the fusion thread
 
@@ -206,25 +212,6 @@ class Alerts:
         except OutboxError as error:
             _log.debug("%s", error)  # the thread reports it
 
-    def resend(self, number: int) -> None:
-        """Let a dead letter be delivered again.
-
-        Raises
-        ------
-        LookupError
-            If there is none of that number, or the site file no longer has its action.
-        """
-        action = self.outbox.action_of_dead(number)
-        if action is None:
-            raise LookupError(f"no dead letter {number}; GET alerts/dead-letters lists them")
-        if action not in self.couriers:
-            cure = "add it to alerts.actions, or dismiss the dead letter with DELETE"
-            raise LookupError(
-                f"dead letter {number} is for action {action!r}, which the site file does not have; {cure}"
-            )
-        self.outbox.resend(number, self._around.clock.now_ns())
-        self._thread.wake_couriers()
-
     def take_over(self, config: AlertsConfig) -> None:
         """Judge and deliver by other rules and actions from now on, as after a restart with them.
 
@@ -296,13 +283,9 @@ class Alerts:
             lambda changes: self._announce(self._in_force.judge.judge_changes(changes))
         )
         now_ns = self._around.clock.now_ns()
-        if self._in_force.judges_conditions and not self._conditions.site_time.is_replay:
-            arrays = self._conditions.array_states.describe(levels=False)
-            self._announce(self._in_force.judge.judge_conditions(arrays, self._conditions.set_up_watch.state, now_ns))
-        days = self._site.store.retention_days
-        if days is not None and now_ns - self._expired_ns >= EXPIRE_NS:
-            self._expired_ns = now_ns
-            self.outbox.expire(max(now_ns - round(days * DAY_NS), 0))
+        if self._in_force.judges_conditions:
+            self._announce(self._conditions.judge(self._in_force.judge, now_ns))
+        self._retention.delete_old(self.outbox, now_ns)
 
     def _announce(self, alerts: Sequence[JsonObject]) -> None:
         """Log and publish new alerts, and have them delivered."""

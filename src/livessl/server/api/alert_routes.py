@@ -13,6 +13,7 @@ from fastapi import APIRouter, HTTPException, Path, Query, Request, Response
 from livessl.clock import utc_text
 from livessl.schema import alerts as alert_schema
 from livessl.schema.answers import errors
+from livessl.server.alerts.dead_letters import DeadLetters
 from livessl.server.alerts.history import DryRun, DryRunBusyError
 from livessl.server.alerts.outbox import Delivery, DeliveryState, OutboxError
 from livessl.server.alerts.picture import DEFAULT_PX, MAX_PX
@@ -139,8 +140,14 @@ def _add_rule_routes(router: APIRouter, parts: Parts) -> None:
 
 def dead_letter_routes(parts: Parts) -> APIRouter:
     """Alerts that an action has given up: they can be delivered again, or dismissed."""
-    alerts, router = parts.alerts, APIRouter(prefix="/api/v1/alerts", tags=["alerts"])
+    router, letters = APIRouter(prefix="/api/v1/alerts", tags=["alerts"]), parts.alerts.dead_letters
+    _add_dead_letters(router, letters)
+    _add_resending(router, letters)
+    _add_dismissal(router, letters)
+    return router
 
+
+def _add_dead_letters(router: APIRouter, letters: DeadLetters) -> None:
     @router.get(
         "/dead-letters", response_model=alert_schema.DeadLetterPage, responses=errors(503, texts={503: _OUTBOX})
     )
@@ -152,11 +159,13 @@ def dead_letter_routes(parts: Parts) -> APIRouter:
     ) -> Response:
         """Alerts that an action has given up, newest first."""
         with _outbox_errors():
-            rows = alerts.outbox.dead(limit + 1, before)
+            rows = letters.page(limit + 1, before)
         found = [{**_delivery(delivery), "alert": alert} for delivery, alert in rows[:limit]]
         next_before = rows[limit - 1][0].number if len(rows) > limit else None
         return as_json({"v": API_VERSION, "dead_letters": found, "next_before": next_before})
 
+
+def _add_resending(router: APIRouter, letters: DeadLetters) -> None:
     @router.post(
         "/dead-letters/{number}/resend",
         response_model=alert_schema.Resent,
@@ -166,21 +175,23 @@ def dead_letter_routes(parts: Parts) -> APIRouter:
         """Deliver a dead letter again; for operators."""
         with _outbox_errors():
             try:
-                alerts.resend(number)
+                letters.resend(number)
             except LookupError as error:
                 raise HTTPException(404, str(error)) from error
         _log.info("%r has sent dead letter %d again", request.scope["client_name"], number)
         return as_json({"v": API_VERSION, "number": number})
 
+
+def _add_dismissal(router: APIRouter, letters: DeadLetters) -> None:
     @router.delete(
         "/dead-letters/{number}",
         response_model=alert_schema.Dismissed,
         responses=errors(404, 411, 413, 503, texts={404: "There is no dead letter of that number.", 503: _OUTBOX}),
     )
     def delete_dead_letter(number: Annotated[int, Path(ge=1, le=2**63 - 1)], request: Request) -> Response:
-        """Dismiss a dead letter: nobody delivers it any more; for operators."""
+        """Dismiss a dead letter, so that it is not delivered any more; for operators."""
         with _outbox_errors():
-            found = alerts.outbox.dismiss(number)
+            found = letters.dismiss(number)
         if not found:
             raise HTTPException(404, f"no dead letter {number}; GET alerts/dead-letters lists them")
         _log.info("%r has dismissed dead letter %d", request.scope["client_name"], number)
@@ -195,11 +206,9 @@ def dead_letter_routes(parts: Parts) -> APIRouter:
     ) -> Response:
         """Dismiss all dead letters, or those of an action, which the site need not have any more; for operators."""
         with _outbox_errors():
-            found = alerts.outbox.dismiss(action=action)
+            found = letters.dismiss(action=action)
         _log.info("%r has dismissed %d dead letters", request.scope["client_name"], found)
         return as_json({"v": API_VERSION, "dismissed": found})
-
-    return router
 
 
 def _check_rule(parts: Parts, name: str) -> None:
