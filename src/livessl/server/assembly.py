@@ -1,11 +1,15 @@
-"""The list of what runs in a server: `assemble` makes all parts and connects them; `app` starts and stops them."""
+"""The list of what runs in a server: `assemble` makes all parts and connects them; `app` starts and stops them.
+
+Each part is a property of `_Assembly`, which makes it when it is first needed. What a part needs is therefore made
+before it, and a part that another one needs only while the server runs is passed as a function.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property
 
 from livessl.clock import Clock
 from livessl.server.alerts.evidence import Evidence
@@ -16,12 +20,13 @@ from livessl.server.array_states import ArrayStates
 from livessl.server.clips.listeners import Listeners
 from livessl.server.clips.relocate import Relocator
 from livessl.server.clips.service import Clips
+from livessl.server.distribution import Distribution
 from livessl.server.engine import Engine
 from livessl.server.event_log import EventLog
 from livessl.server.event_traces import EventTraces
 from livessl.server.fanout import Fanout
 from livessl.server.forwarding.link import HubLink
-from livessl.server.journal import Journal, also
+from livessl.server.journal import Journal
 from livessl.server.latency import Latency
 from livessl.server.maps import Maps
 from livessl.server.overload import Overload
@@ -34,6 +39,7 @@ from livessl.server.recent_log import RecentLog
 from livessl.server.reload import Reloader
 from livessl.server.set_up_in_force import SetUpInForce
 from livessl.server.set_up_watch import SetUpWatch
+from livessl.server.shared_state import SharedState
 from livessl.server.signed_links import SignedLinks
 from livessl.server.sinks import Sinks
 from livessl.server.site_time import SiteTime
@@ -103,109 +109,222 @@ def assemble(
     read_site : callable or None
         Reads the site file again; None for a server without one.
     links : SignedLinks or None
-        Signs links for people without a token; None if nobody needs one.
+        Signs links for people without a token; None if every reader has one.
 
     Raises
     ------
     BindError, ConfigError, ClipsError
         See `Receiver`, `Alerts` and `Clips`.
     """
-    store, publish = outlets.store, outlets.publish
-
-    def publish_to_all(message: JsonObject) -> None:
-        if hub_link is not None and not site_time.is_replay:
-            hub_link.messages.take(message)
-        publish(message)
-
     with ExitStack() as undo:
         if receiver is None:
             receiver = Receiver(site, clock)
             undo.callback(receiver.stop)
-        site_time = SiteTime(clock)
-        journal = Journal(store, clock)
-        journal.site(site)
-        hub_link = None
-        if store.outbox is not None:
-            hub_link = HubLink(site, clock, store.outbox, store.backlog, lambda: array_states.describe(levels=False))
-        zone_book = ZoneBook(site, publish)
-
-        def zones() -> ZoneMap:
-            return zone_book.current
-
-        latency, maps = Latency(clock, receiver.arrivals), Maps(clock)
-        overload = Overload(clock)
-        # milliseconds since the epoch: a restarted server gives no sound the number of an earlier one
-        set_up_watch = SetUpWatch(site, overload, first_sound=clock.now_ns() // 1_000_000)
-        found = traces_in_use()
-        traces = None if found is None else EventTraces(found)
-
-        def keep_alert(alert: JsonObject) -> None:
-            journal.alert(alert, partial(alerts.note_in_journal, alert) if store.is_durable else None)
-
-        publish_arrays, publish_alert = also(journal.arrays, publish_to_all), also(keep_alert, publish_to_all)
-        array_states = ArrayStates(
-            site, clock, store, site_time, receiver.ingest, overload, set_up_watch, publish_arrays
-        )
-        set_up = SetUpInForce(site, clock, publish)
-        kept, listeners = site.server.clips, Listeners()
-        clips = None if kept is None else Clips(site, kept, clock, site_time, overload)
-        relocator = None if clips is None else Relocator(clips.folder, clock, lambda: set_up.site, overload)
-        evidence = Evidence(lambda: set_up.site, zones, clips)
-        around = Surroundings(clock, store, zones, url, evidence, traces, links)
-        alerts = Alerts(site, around, Conditions(array_states, set_up_watch, site_time), publish_alert)
-        undo.callback(alerts.stop)
-
-        def publish_change(change: JsonObject, time_ns: int) -> None:
-            if not site_time.is_replay:
-                alerts.take_change(change, time_ns)
-            publish(change)
-
-        presence = Presence(zones, publish_change)
-        tracks = Tracks(presence, Trails(journal, lambda: site_time.is_replay))
-        event_log = EventLog(site.site, clock, store, latency, outlets.publish_event, alerts, traces)
-        publisher = Publisher(
-            publish_to_all, receiver.request, site_time, event_log, tracks, maps, latency, overload, set_up_watch, clips
-        )
-        sound = (listeners,) if clips is None else (listeners, clips)
-        engine = Engine(
-            site, clock, receiver, site_time, array_states, event_log, maps, publisher, overload, zones, sound, traces
-        )
-        proposals = Proposals(set_up, set_up_watch.heard, clock)
-        refiner = PoseRefiner(proposals, set_up, set_up_watch.heard, overload)
-        for follower in (engine.prepare, set_up_watch.prepare, *(() if clips is None else (clips.prepare,))):
-            set_up.follow(follower)
-        floor_plan = read_floor_plan(site)
-        reloader = Reloader(site, read_site, zone_book, alerts, journal.site, set_up)
+        parts = _Assembly(site, clock, outlets, receiver, url, read_site, links, undo).parts()
         undo.pop_all()
-    return Parts(
-        site=site,
-        clock=clock,
-        receiver=receiver,
-        refusals=receiver.refusals,
-        engine=engine,
-        site_time=site_time,
-        array_states=array_states,
-        event_log=event_log,
-        alerts=alerts,
-        clips=clips,
-        relocator=relocator,
-        listeners=listeners,
-        tracks=tracks,
-        maps=maps,
-        latency=latency,
-        overload=overload,
-        set_up=set_up,
-        proposals=proposals,
-        refiner=refiner,
-        set_up_watch=set_up_watch,
-        store=store,
-        sinks=outlets.sinks,
-        fanout=outlets.fanout,
-        zone_book=zone_book,
-        journal=journal,
-        presence=presence,
-        floor_plan=floor_plan,
-        hub_link=hub_link,
-        reloader=reloader,
-        recent_log=RecentLog(),
-    )
+    return parts
+
+
+@dataclass
+class _Assembly:
+    """The parts of a server while they are made; `undo` gets what stops those that hold something."""
+
+    site: Site
+    clock: Clock
+    outlets: Outlets
+    receiver: Inbox
+    url: str
+    read_site: Callable[[], Site] | None
+    links: SignedLinks | None
+    undo: ExitStack
+
+    def parts(self) -> Parts:
+        """Make all parts, and connect those that follow the poses in force."""
+        parts = Parts(
+            site=self.site,
+            clock=self.clock,
+            receiver=self.receiver,
+            refusals=self.receiver.refusals,
+            store=self.outlets.store,
+            sinks=self.outlets.sinks,
+            fanout=self.outlets.fanout,
+            site_time=self.shared.site_time,
+            latency=self.shared.latency,
+            maps=self.shared.maps,
+            overload=self.shared.overload,
+            journal=self.journal,
+            hub_link=self.hub_link,
+            zone_book=self.zone_book,
+            set_up_watch=self.set_up_watch,
+            array_states=self.array_states,
+            set_up=self.set_up,
+            listeners=self.listeners,
+            clips=self.clips,
+            relocator=self.relocator,
+            alerts=self.alerts,
+            presence=self.presence,
+            tracks=self.tracks,
+            event_log=self.event_log,
+            engine=self.engine,
+            proposals=self.proposals,
+            refiner=PoseRefiner(self.proposals, self.set_up, self.set_up_watch.heard, self.shared.overload),
+            floor_plan=read_floor_plan(self.site),
+            reloader=self.reloader,
+            recent_log=RecentLog(),
+        )
+        for follower in (self.engine, self.set_up_watch, self.clips):
+            if follower is not None:
+                self.set_up.follow(follower.prepare)
+        return parts
+
+    @cached_property
+    def shared(self) -> SharedState:
+        latency = Latency(self.clock, self.receiver.arrivals)
+        return SharedState(self.site, self.clock, SiteTime(self.clock), latency, Maps(self.clock), Overload(self.clock))
+
+    # --- what is kept and passed on
+
+    @cached_property
+    def journal(self) -> Journal:
+        journal = Journal(self.outlets.store, self.clock)
+        journal.site(self.site)
+        return journal
+
+    @cached_property
+    def hub_link(self) -> HubLink | None:
+        store = self.outlets.store
+        if store.outbox is None:
+            return None
+        return HubLink(
+            self.site, self.clock, store.outbox, store.backlog, lambda: self.array_states.describe(levels=False)
+        )
+
+    @cached_property
+    def distribution(self) -> Distribution:
+        return Distribution(
+            self.outlets.publish,
+            self.shared.site_time,
+            self.journal,
+            self.hub_link,
+            lambda: self.alerts,
+            self.outlets.store.is_durable,
+        )
+
+    @cached_property
+    def traces(self) -> EventTraces | None:
+        found = traces_in_use()
+        return None if found is None else EventTraces(found)
+
+    # --- arrays and their poses
+
+    @cached_property
+    def set_up_watch(self) -> SetUpWatch:
+        # milliseconds since the epoch: a restarted server gives no sound the number of an earlier one
+        return SetUpWatch(self.site, self.shared.overload, first_sound=self.clock.now_ns() // 1_000_000)
+
+    @cached_property
+    def array_states(self) -> ArrayStates:
+        return ArrayStates(
+            self.site,
+            self.clock,
+            self.outlets.store,
+            self.shared.site_time,
+            self.receiver.ingest,
+            self.shared.overload,
+            self.set_up_watch,
+            self.distribution.take_arrays,
+        )
+
+    @cached_property
+    def set_up(self) -> SetUpInForce:
+        return SetUpInForce(self.site, self.clock, self.outlets.publish)
+
+    @cached_property
+    def proposals(self) -> Proposals:
+        return Proposals(self.set_up, self.set_up_watch.heard, self.clock)
+
+    # --- zones and tracks
+
+    @cached_property
+    def zone_book(self) -> ZoneBook:
+        return ZoneBook(self.site, self.outlets.publish)
+
+    def zones(self) -> ZoneMap:
+        """Return the zones that are in force."""
+        return self.zone_book.current
+
+    @cached_property
+    def presence(self) -> Presence:
+        return Presence(self.zones, self.distribution.take_change)
+
+    @cached_property
+    def tracks(self) -> Tracks:
+        return Tracks(self.presence, Trails(self.journal, lambda: self.shared.site_time.is_replay))
+
+    # --- sound
+
+    @cached_property
+    def listeners(self) -> Listeners:
+        return Listeners()
+
+    @cached_property
+    def clips(self) -> Clips | None:
+        config = self.site.server.clips
+        if config is None:
+            return None
+        return Clips(self.site, config, self.clock, self.shared.site_time, self.shared.overload)
+
+    @cached_property
+    def relocator(self) -> Relocator | None:
+        if self.clips is None:
+            return None
+        return Relocator(self.clips.folder, self.clock, lambda: self.set_up.site, self.shared.overload)
+
+    # --- events and alerts
+
+    @cached_property
+    def alerts(self) -> Alerts:
+        evidence = Evidence(lambda: self.set_up.site, self.zones, self.clips)
+        around = Surroundings(self.clock, self.outlets.store, self.zones, self.url, evidence, self.traces, self.links)
+        conditions = Conditions(self.array_states, self.set_up_watch, self.shared.site_time)
+        alerts = Alerts(self.site, around, conditions, self.distribution.take_alert)
+        self.undo.callback(alerts.stop)
+        return alerts
+
+    @cached_property
+    def event_log(self) -> EventLog:
+        return EventLog(
+            self.site.site,
+            self.clock,
+            self.outlets.store,
+            self.shared.latency,
+            self.outlets.publish_event,
+            self.alerts,
+            self.traces,
+        )
+
+    @cached_property
+    def engine(self) -> Engine:
+        publisher = Publisher(
+            self.shared,
+            self.distribution.take,
+            self.receiver.request,
+            self.event_log,
+            self.tracks,
+            self.set_up_watch,
+            self.clips,
+        )
+        return Engine(
+            self.shared,
+            self.receiver,
+            self.array_states,
+            self.event_log,
+            publisher,
+            self.zones,
+            (self.listeners,) if self.clips is None else (self.listeners, self.clips),
+            self.traces,
+        )
+
+    @cached_property
+    def reloader(self) -> Reloader:
+        return Reloader(self.site, self.read_site, self.zone_book, self.alerts, self.journal.site, self.set_up)

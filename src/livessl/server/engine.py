@@ -10,19 +10,16 @@ from functools import partial
 from typing import Final, Protocol
 
 from livessl import wire
-from livessl.clock import Clock
 from livessl.core.stream.site_state import ArraySetUp
 from livessl.core.types import FRAME_NS, Message
 from livessl.server.array_states import ArrayStates
 from livessl.server.event_log import EventLog
 from livessl.server.event_traces import EventTraces
-from livessl.server.maps import Maps
-from livessl.server.overload import Overload
 from livessl.server.parallel import Parallel
 from livessl.server.publisher import Publisher
 from livessl.server.receiver import Greeted, Inbox, Joined, Left
 from livessl.server.run import Run, live_run, replay_run
-from livessl.server.site_time import SiteTime
+from livessl.server.shared_state import SharedState
 from livessl.server.zones.zone_map import ZoneMap
 from livessl.site.build.fusion import make_array_set_up
 from livessl.site.models import Site
@@ -49,15 +46,11 @@ class Engine:
 
     Parameters
     ----------
-    site : Site
-    clock : Clock
+    shared : SharedState
     receiver : Inbox
-    site_time : SiteTime
     array_states : ArrayStates
     event_log : EventLog
-    maps : Maps
     publisher : Publisher
-    overload : Overload
     zones : callable
         Returns the zones that are in force.
     sound_takers : sequence of SoundTaker
@@ -68,29 +61,25 @@ class Engine:
 
     def __init__(
         self,
-        site: Site,
-        clock: Clock,
+        shared: SharedState,
         receiver: Inbox,
-        site_time: SiteTime,
         array_states: ArrayStates,
         event_log: EventLog,
-        maps: Maps,
         publisher: Publisher,
-        overload: Overload,
         zones: Callable[[], ZoneMap],
         sound_takers: Sequence[SoundTaker] = (),
         traces: EventTraces | None = None,
     ) -> None:
         self._traces = traces
-        self._site = site
-        self._clock = clock
+        self._site = shared.site
+        self._clock = shared.clock
         self._receiver = receiver
-        self._site_time = site_time
+        self._site_time = shared.site_time
         self._array_states = array_states
         self._event_log = event_log
-        self._maps = maps
+        self._maps = shared.maps
         self._publisher = publisher
-        self._overload = overload
+        self._overload = shared.overload
         self._zones = zones
         self._sound_takers = sound_takers
         self._rates_hz: dict[str, float] = {}  # of the arrays whose nodes have joined
@@ -103,7 +92,7 @@ class Engine:
         self._thread = threading.Thread(target=self._work, name="fusion", daemon=True)
         self.failure: BaseException | None = None
         """The error that has ended the thread, if it has ended."""
-        self._begin(live_run(site, event_log.begin_live(), self._parallel.for_each))
+        self._begin(live_run(shared.site, event_log.begin_live(), self._parallel.for_each))
 
     @property
     def has_turned(self) -> bool:

@@ -129,16 +129,6 @@ class Journal:
         self._store.backlog.put(write, self._clock.monotonic_ns())
 
 
-def also(first: Callable[[JsonObject], None], second: Callable[[JsonObject], None]) -> Callable[[JsonObject], None]:
-    """Return what hands a message to both."""
-
-    def both(message: JsonObject) -> None:
-        first(message)
-        second(message)
-
-    return both
-
-
 def _of_site(sections: dict[str, str], changed: list[str]) -> JsonObject:
     return {"version": __version__, "changed": changed, "sections": sections}
 

@@ -10,12 +10,9 @@ from livessl.core.types import BackfillRequest, Event, Output, Track, Update, Wi
 from livessl.server.api.encode import JsonObject
 from livessl.server.clips.service import Clips
 from livessl.server.event_log import EventLog
-from livessl.server.latency import Latency
-from livessl.server.maps import Maps
-from livessl.server.overload import Overload
 from livessl.server.run import Run
 from livessl.server.set_up_watch import SetUpWatch
-from livessl.server.site_time import SiteTime
+from livessl.server.shared_state import SharedState
 from livessl.server.tracks import Tracks
 
 
@@ -24,17 +21,13 @@ class Publisher:
 
     Parameters
     ----------
+    shared : SharedState
     publish : callable
         Gets every message for subscribers.
     request : callable
         Sends a request for missing frames to an array's node.
-    site_time : SiteTime
     event_log : EventLog
     tracks : Tracks
-    maps : Maps
-    latency : Latency
-    overload : Overload
-        Knows whether maps are drawn.
     set_up_watch : SetUpWatch
         Examines the set-up with the final events.
     clips : Clips or None
@@ -43,25 +36,19 @@ class Publisher:
 
     def __init__(
         self,
+        shared: SharedState,
         publish: Callable[[JsonObject], None],
         request: Callable[[BackfillRequest], None],
-        site_time: SiteTime,
         event_log: EventLog,
         tracks: Tracks,
-        maps: Maps,
-        latency: Latency,
-        overload: Overload,
         set_up_watch: SetUpWatch,
         clips: Clips | None = None,
     ) -> None:
+        self._shared = shared
         self._publish = publish
         self._request = request
-        self._site_time = site_time
         self._event_log = event_log
         self._tracks = tracks
-        self._maps = maps
-        self._latency = latency
-        self._overload = overload
         self._set_up_watch = set_up_watch
         self._clips = clips
 
@@ -81,15 +68,15 @@ class Publisher:
                 case Event():
                     self._event_log.add_early(output, messages)
                 case Update():
-                    stages = None if self._site_time.is_replay else self._latency.located(output)
+                    stages = None if self._shared.site_time.is_replay else self._shared.latency.located(output)
                     self._publish(messages.update(output, stages))
                 case Track():
                     message = messages.track(output)
                     self._tracks.note(output, message)
                     self._publish(message)
                 case Window():
-                    if self._overload.relief.maps:
-                        self._maps.show(output, run.fusion.power_maps)
+                    if self._shared.overload.relief.maps:
+                        self._shared.maps.show(output, run.fusion.power_maps)
                 case BackfillRequest():
                     self._request(output)
                 case _:

@@ -50,7 +50,7 @@ class Conditions:
         Has the findings.
     site_time : SiteTime
         Knows whether a replay runs: then conditions are not judged. Its events and changes of zones are not passed on
-        to here at all (`event_log`, `assembly`).
+        to here at all (`event_log`, `distribution`).
     """
 
     array_states: ArrayStates
