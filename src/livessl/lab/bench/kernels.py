@@ -8,7 +8,7 @@ reported.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
@@ -263,22 +263,33 @@ def _cases(arrays: Sequence[int], spacings_m: Sequence[float]) -> Iterator[Case]
             f"samples to peak, {arrays[0]} arrays, {spacing_m:g} m, voice",
             lambda n, search=search: search.among(evidence("voice", n, arrays[0]))(1),  # type: ignore[misc]
         )
-    grid = Grid(room, 0.1)
     specs = most[: arrays[0]]
+    yield _drawn_map(specs, Grid(room, 0.1), correlate, [heard["voice", n] for n in range(12)])
+    yield _located(specs, Grid(room, 0.05), [made["voice", n] for n in range(12)])
+
+
+def _drawn_map(
+    specs: Sequence[ArraySpec], grid: Grid, correlate: Mapping[str, GCCPhat], looks: Sequence[list[Evidence]]
+) -> Case:
+    """Return the case of the map that is drawn of a window, from the evidence of several windows in turns."""
     mappers = [SRPMapper(s, grid, correlate[s.name].pairs, correlate[s.name].lags_s, C_M_S) for s in specs]
     power = np.zeros(grid.size, dtype=np.float32)
 
     def draw(number: int) -> None:
         power[:] = 0.0
-        for mapper, one in zip(mappers, heard["voice", number % 12], strict=False):
+        for mapper, one in zip(mappers, looks[number % len(looks)], strict=False):
             mapper.add(power, one.gcc)
 
     pairs = sum(len(correlate[spec.name].pairs) for spec in specs)
-    yield Case(f"map, {arrays[0]} arrays, 0.1 m", draw, pairs * grid.size)
-    estimator = SrpPhat(specs, Grid(room, 0.05), C_M_S)
+    return Case(f"map, {len(specs)} arrays, {grid.spacing_m:g} m", draw, pairs * grid.size)
+
+
+def _located(specs: Sequence[ArraySpec], grid: Grid, sounds: Sequence[Sequence[Float32Array]]) -> Case:
+    """Return the case of an event that is located from its samples, of several events in turns."""
+    estimator = SrpPhat(specs, grid, C_M_S)
 
     def locate(number: int) -> None:
-        sounds = made["voice", number % 12]
-        estimator.locate({s.name: Sound((x,), RATE_HZ) for s, x in zip(specs, sounds, strict=False)})
+        sound = sounds[number % len(sounds)]
+        estimator.locate({s.name: Sound((x,), RATE_HZ) for s, x in zip(specs, sound, strict=False)})
 
-    yield Case(f"located, {arrays[0]} arrays, with covariance and confidence", locate)
+    return Case(f"located, {len(specs)} arrays, with covariance and confidence", locate)

@@ -44,8 +44,16 @@ _log = logging.getLogger(__name__)
 
 def clip_routes(parts: Parts) -> APIRouter:
     """Figures, lists, recordings, and what operators may do with them."""
-    clips, router = parts.clips, APIRouter(prefix="/api/v1", tags=["clips"])
-    _add_recordings(router, clips)
+    router = APIRouter(prefix="/api/v1", tags=["clips"])
+    _add_recordings(router, parts.clips)
+    _add_lists(router, parts)
+    _add_changes(router, parts.clips)
+    return router
+
+
+def _add_lists(router: APIRouter, parts: Parts) -> None:
+    """Add the routes that say what there is."""
+    clips = parts.clips
 
     @router.get("/clips", response_model=clip_schema.ClipsState)
     def get_clips() -> Response:
@@ -88,6 +96,10 @@ def clip_routes(parts: Parts) -> APIRouter:
         }
         return as_json(found)
 
+
+def _add_changes(router: APIRouter, clips: Clips | None) -> None:
+    """Add the routes by which operators keep and delete recordings."""
+
     @router.put(
         "/events/{event_id}/clips/keep",
         response_model=clip_schema.Kept,
@@ -117,8 +129,6 @@ def clip_routes(parts: Parts) -> APIRouter:
                 raise _no_clip(event_id)
         _log.info("%r has deleted the clips of %r", request.scope["client_name"], event_id)
         return as_json({"v": API_VERSION, "event_id": event_id})
-
-    return router
 
 
 def _add_recordings(router: APIRouter, clips: Clips | None) -> None:

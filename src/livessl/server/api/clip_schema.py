@@ -62,7 +62,7 @@ class KeepSwitch(BaseModel):
 
     model_config = ConfigDict(extra="forbid", strict=True)
 
-    keep: bool = Field(description="`true` keeps them until somebody deletes them.", examples=[True])
+    keep: bool = Field(description="`true` keeps them until they are deleted by request.", examples=[True])
 
 
 class Kept(BaseModel):

@@ -40,8 +40,15 @@ _log = logging.getLogger(__name__)
 
 def live_routes(parts: Parts, names: ServerNames) -> APIRouter:
     """The WebSockets of messages, of power maps, and of sound."""
-    site, fanout, router = parts.site, parts.fanout, APIRouter()
-    book = parts.zone_book
+    router = APIRouter()
+    _add_messages(router, parts, names)
+    _add_maps(router, parts, names)
+    _add_sound(router, parts, names)
+    return router
+
+
+def _add_messages(router: APIRouter, parts: Parts, names: ServerNames) -> None:
+    fanout, book = parts.fanout, parts.zone_book
 
     @router.websocket(LIVE)
     async def live(
@@ -70,13 +77,15 @@ def live_routes(parts: Parts, names: ServerNames) -> APIRouter:
         finally:
             fanout.unsubscribe(subscription)
 
+
+def _add_maps(router: APIRouter, parts: Parts, names: ServerNames) -> None:
     @router.websocket(MAP)
     async def watch_map(socket: WebSocket, array: str = FUSED, views: str = "floor") -> None:
         await socket.accept()
         try:
             _refuse_other_pages(socket, names, parts.refusals)
             queries.check_parameters(socket.query_params, queries.MapParameters)
-            chosen = queries.chosen_views(site, array, views)
+            chosen = queries.chosen_views(parts.site, array, views)
         except ValueError as error:
             await _refuse(socket, error)
             return
@@ -88,6 +97,8 @@ def live_routes(parts: Parts, names: ServerNames) -> APIRouter:
         with parts.maps.watching(array, chosen, drawn):
             await _while_connected(socket, _send_pictures(socket, parts, array, chosen, news))
 
+
+def _add_sound(router: APIRouter, parts: Parts, names: ServerNames) -> None:
     @router.websocket(LISTEN)
     async def listen(socket: WebSocket, array: str = "", channel: str = "1") -> None:
         await socket.accept()
@@ -95,7 +106,7 @@ def live_routes(parts: Parts, names: ServerNames) -> APIRouter:
             try:
                 _refuse_other_pages(socket, names, parts.refusals)
                 queries.check_parameters(socket.query_params, queries.ListenParameters)
-                number = queries.chosen_microphone(site, array, channel)
+                number = queries.chosen_microphone(parts.site, array, channel)
                 listener = stack.enter_context(parts.listeners.listening(array, number))
             except ValueError as error:
                 await _refuse(socket, error)
@@ -104,8 +115,6 @@ def live_routes(parts: Parts, names: ServerNames) -> APIRouter:
             _log.info("%r listens to microphone %d of array %r", who, number, array)
             await _while_connected(socket, _send_sound(socket, listener))
             _log.info("%r listens no longer", who)
-
-    return router
 
 
 def greeting(parts: Parts, role: str, arrays: Sequence[JsonObject]) -> JsonObject:

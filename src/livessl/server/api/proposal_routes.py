@@ -36,8 +36,15 @@ _log = logging.getLogger(__name__)
 
 def proposal_routes(parts: Parts) -> APIRouter:
     """Routes of the set-up in force, of proposals for its poses, and of changes to it."""
-    set_up, proposals, router = parts.set_up, parts.proposals, APIRouter(tags=["state"])
-    first = _FirstPlace()
+    router = APIRouter(tags=["state"])
+    _add_state(router, parts)
+    _add_proposals(router, parts)
+    _add_changes(router, parts)
+    return router
+
+
+def _add_state(router: APIRouter, parts: Parts) -> None:
+    set_up, first = parts.set_up, _FirstPlace()
 
     @router.get("/api/v1/set-up", response_model=set_up_schema.SetUp)
     def get_set_up() -> Response:
@@ -51,6 +58,10 @@ def proposal_routes(parts: Parts) -> APIRouter:
                 "refinement": _refinement(parts.refiner.refinement),
             }
         )
+
+
+def _add_proposals(router: APIRouter, parts: Parts) -> None:
+    proposals = parts.proposals
 
     @router.post("/api/v1/set-up/measure", response_model=set_up_schema.OneProposal, responses=_ERRORS)
     def post_measure(request: set_up_schema.MeasureRequest) -> Response:
@@ -76,18 +87,22 @@ def proposal_routes(parts: Parts) -> APIRouter:
 
     @router.post("/api/v1/set-up/move", response_model=set_up_schema.OneProposal, responses=_ERRORS)
     def post_move(request: set_up_schema.MoveRequest) -> Response:
-        """Propose poses that somebody typed or dragged. The proposal changes nothing."""
+        """Propose poses that were typed or dragged. The proposal changes nothing."""
         _require(parts, request.arrays)
         poses = {name: (np.array(one.position_m), np.array(one.turn_deg)) for name, one in request.arrays.items()}
         with _refusals():
             proposal = proposals.typed(poses)
         return _answer(proposal)
 
+
+def _add_changes(router: APIRouter, parts: Parts) -> None:
+    set_up = parts.set_up
+
     @router.post("/api/v1/set-up/accept", response_model=set_up_schema.Changed, responses=_ERRORS)
     def post_accept(accept: set_up_schema.AcceptRequest, request: Request) -> Response:
         """Write a proposal into the calibration file and bring it into force, without a restart."""
         with _refusals():
-            changed = proposals.accept(accept.id)
+            changed = parts.proposals.accept(accept.id)
         return _changed(parts, changed, f"has accepted {accept.id}", request)
 
     @router.post("/api/v1/set-up/undo", response_model=set_up_schema.Changed, responses=_ERRORS)
@@ -103,8 +118,6 @@ def proposal_routes(parts: Parts) -> APIRouter:
         with _refusals():
             changed = set_up.reload()
         return _changed(parts, changed, "had the calibration file read again", request)
-
-    return router
 
 
 class _FirstPlace:

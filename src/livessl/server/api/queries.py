@@ -144,8 +144,8 @@ async def refuse_request(_request: Request, error: Exception) -> Response:
     try:
         body = orjson.dumps({"detail": jsonable_encoder(faults)})
     except (TypeError, ValueError, RecursionError):
-        told = [{name: fault[name] for name in ("type", "loc", "msg")} for fault in faults]
-        body = orjson.dumps({"detail": jsonable_encoder(told)})
+        bare = [{name: fault[name] for name in ("type", "loc", "msg")} for fault in faults]
+        body = orjson.dumps({"detail": jsonable_encoder(bare)})
     return Response(body, 422, media_type="application/json")
 
 
@@ -259,7 +259,7 @@ def chosen_microphone(site: Site, array: str, channel: str) -> int:
     Raises
     ------
     ValueError
-        If the site permits nobody to listen, or the array or the channel does not exist.
+        If the site does not permit listening, or the array or the channel does not exist.
     """
     if not site.server.listen:
         raise ValueError("listen: the site file does not permit it; set server.listen: true")

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Annotated, Final
 
 from fastapi import APIRouter, HTTPException, Query, Request, Response
@@ -32,13 +34,24 @@ _log = logging.getLogger(__name__)
 
 def relocate_route(parts: Parts) -> APIRouter:
     """Both answers beside each other."""
-    clips, relocator, router = parts.clips, parts.relocator, APIRouter(prefix="/api/v1", tags=["clips"])
+    router = APIRouter(prefix="/api/v1", tags=["clips"])
+    _add_settings(router, parts)
+    _add_relocation(router, parts)
+    return router
+
+
+def _add_settings(router: APIRouter, parts: Parts) -> None:
+    relocator = parts.relocator
 
     @router.get("/relocation-settings", response_model=relocation.RelocationSettings)
     def get_relocation_settings(method: Method = None, set_up: SetUpWanted = "then") -> Response:
         """Digest that answers of `POST events/{id}/relocate` with this method and set-up would have now."""
         site = parts.site if relocator is None else relocator.site
         return as_json({"v": API_VERSION, "digest": digest_of(site, method, set_up)})
+
+
+def _add_relocation(router: APIRouter, parts: Parts) -> None:
+    clips, relocator = parts.clips, parts.relocator
 
     @router.post(
         "/events/{event_id}/relocate",
@@ -61,16 +74,8 @@ def relocate_route(parts: Parts) -> APIRouter:
             raise HTTPException(404, f"event {event_id!r} has no recordings: {_why_none(parts)}")
         if clips.is_waiting(event_id):
             raise HTTPException(409, f"the recordings of {event_id!r} are being made; try again in some seconds")
-        try:
+        with _refusals():
             found, site, took_s = relocator.relocate(event_id, method, wanted.set_up)
-        except NoClipError as error:
-            raise HTTPException(404, str(error)) from error
-        except BusyError as error:
-            raise HTTPException(503, str(error)) from error
-        except RelocationError as error:
-            raise HTTPException(409, str(error)) from error
-        except ConfigError as error:  # a method of the site's own that cannot be imported any more
-            raise HTTPException(409, "; ".join(map(str, error.faults))) from error
         _log.info("%r has located %r again by %r", request.scope["client_name"], event_id, method)
         return as_json(
             {
@@ -87,7 +92,20 @@ def relocate_route(parts: Parts) -> APIRouter:
             }
         )
 
-    return router
+
+@contextmanager
+def _refusals() -> Iterator[None]:
+    """Answer with the status of what keeps an event from being located again."""
+    try:
+        yield
+    except NoClipError as error:
+        raise HTTPException(404, str(error)) from error
+    except BusyError as error:
+        raise HTTPException(503, str(error)) from error
+    except RelocationError as error:
+        raise HTTPException(409, str(error)) from error
+    except ConfigError as error:  # a method of the site's own that cannot be imported any more
+        raise HTTPException(409, "; ".join(map(str, error.faults))) from error
 
 
 def _why_none(parts: Parts) -> str:

@@ -106,8 +106,13 @@ def _secured(site: Site) -> JsonObject:
 
 def state_routes(parts: Parts) -> APIRouter:
     """Site, arrays, tracks and health."""
-    site, router = parts.site, APIRouter()
+    router = APIRouter()
+    _add_state(router, parts)
+    _add_health(router, parts)
+    return router
 
+
+def _add_state(router: APIRouter, parts: Parts) -> None:
     @router.get("/api/v1/site", tags=["state"], response_model=answers.Site)
     def get_site() -> Response:
         """Room, grid, arrays and settings."""
@@ -136,6 +141,10 @@ def state_routes(parts: Parts) -> APIRouter:
         """The tracks that live now."""
         return as_json({"v": API_VERSION, "tracks": parts.tracks.all()})
 
+
+def _add_health(router: APIRouter, parts: Parts) -> None:
+    site = parts.site
+
     @router.get(
         HEALTH,
         tags=["state"],
@@ -163,8 +172,6 @@ def state_routes(parts: Parts) -> APIRouter:
             "refused": {door: parts.refusals.count(door) for door in ("nodes", "http")},
         }
         return as_json(found, code)
-
-    return router
 
 
 def condition(parts: Parts, arrays: Sequence[JsonObject]) -> tuple[str, list[str]]:

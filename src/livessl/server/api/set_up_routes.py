@@ -31,7 +31,14 @@ _TEXTS = {
 
 def set_up_routes(parts: Parts) -> APIRouter:
     """Sounds with their delays, and the verification of the set-up."""
-    heard, router, one_at_a_time = parts.set_up_watch.heard, APIRouter(tags=["state"]), threading.Lock()
+    router = APIRouter(tags=["state"])
+    _add_sounds(router, parts)
+    _add_verification(router, parts)
+    return router
+
+
+def _add_sounds(router: APIRouter, parts: Parts) -> None:
+    heard = parts.set_up_watch.heard
 
     @router.get("/api/v1/sounds", response_model=set_up_schema.HeardSounds)
     def get_sounds(
@@ -42,6 +49,10 @@ def set_up_routes(parts: Parts) -> APIRouter:
         now_utc = utc_text(parts.site_time.now_ns())
         found = [_sound(sound) for sound in sounds]
         return as_json({"v": API_VERSION, "now_utc": now_utc, "last": last, "sounds": found})
+
+
+def _add_verification(router: APIRouter, parts: Parts) -> None:
+    heard, one_at_a_time = parts.set_up_watch.heard, threading.Lock()
 
     @router.post(
         "/api/v1/set-up/verify",
@@ -84,8 +95,6 @@ def set_up_routes(parts: Parts) -> APIRouter:
                 "next_place_m": None if next_m is None else next_m.round(3).tolist(),
             }
         )
-
-    return router
 
 
 def _sound(sound: HeardSound) -> JsonObject:

@@ -107,7 +107,7 @@ class Verified(BaseModel):
     verdict: SetUpVerdict
     claps: list[VerifiedClap]
     findings: list[Finding] = Field(description="What explains the errors.")
-    next_place_m: PlaceM | None = Field(description="Where another clap would tell most; null if no place is free.")
+    next_place_m: PlaceM | None = Field(description="Where another clap would show most; null if no place is free.")
 
 
 class MeasureRequest(VerifyRequest):
@@ -133,7 +133,7 @@ class RefineRequest(BaseModel):
 
 
 class TypedPose(BaseModel):
-    """Pose of an array that somebody typed or dragged."""
+    """Pose of an array that was typed or dragged."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -147,7 +147,7 @@ class TypedPose(BaseModel):
 
 
 class MoveRequest(BaseModel):
-    """Request to propose poses that somebody typed or dragged."""
+    """Request to propose poses that were typed or dragged."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -222,7 +222,7 @@ class FittedClap(BaseModel):
 
 
 class Proposal(BaseModel):
-    """Poses that somebody may accept; they are not in force."""
+    """Poses that an operator may accept; they are not in force."""
 
     id: str = Field(description="Id to accept it by.", examples=["poses-1767225600000-1"])
     method: Literal["poses", "refine", "typed"] = Field(

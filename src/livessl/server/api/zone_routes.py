@@ -33,7 +33,15 @@ _log = logging.getLogger(__name__)
 
 def zone_routes(parts: Parts) -> APIRouter:
     """Zones, changes of tracks in them, and the floor plan."""
-    book, router = parts.zone_book, APIRouter(tags=["zones"])
+    router = APIRouter(tags=["zones"])
+    _add_zones(router, parts)
+    _add_zone_changes(router, parts)
+    _add_floor_plan(router, parts)
+    return router
+
+
+def _add_zones(router: APIRouter, parts: Parts) -> None:
+    book = parts.zone_book
 
     @router.get("/api/v1/zones", response_model=zone_schema.ZoneList)
     def get_zones() -> Response:
@@ -68,6 +76,8 @@ def zone_routes(parts: Parts) -> APIRouter:
         parts.journal.configuration(f"zone {name}", who, f"{who!r} has deleted zone {name!r}", {"zone": None})
         return as_json({"v": API_VERSION, "name": name})
 
+
+def _add_zone_changes(router: APIRouter, parts: Parts) -> None:
     @router.get("/api/v1/zone-changes", response_model=zone_schema.Changes, responses=errors(404, texts=_TEXTS))
     def get_changes(
         zone: Annotated[str | None, Query(description="only changes in this zone")] = None,
@@ -75,11 +85,13 @@ def zone_routes(parts: Parts) -> APIRouter:
     ) -> Response:
         """Tracks that entered, left or loitered in a zone, newest first; a restart forgets them."""
         changes = [change for change in reversed(tuple(parts.presence.changes)) if zone in (None, change["zone"])]
-        zones = book.current.zones
+        zones = parts.zone_book.current.zones
         if zone is not None and zone not in zones and not changes:  # a zone that was deleted keeps its changes
             raise HTTPException(404, f"no zone {zone!r}; zones are {', '.join(zones) or 'none'}")
         return as_json({"v": API_VERSION, "changes": changes[:limit]})
 
+
+def _add_floor_plan(router: APIRouter, parts: Parts) -> None:
     @router.get(
         "/api/v1/floor-plan",
         response_class=Response,
@@ -94,8 +106,6 @@ def zone_routes(parts: Parts) -> APIRouter:
         if picture is None:
             raise HTTPException(404, "the site file names no picture; add floor_plan")
         return Response(picture.data, media_type=picture.media_type)
-
-    return router
 
 
 @contextmanager
