@@ -231,8 +231,9 @@ def test_server_keeps_what_operators_change_and_what_alerts(tmp_path: Path) -> N
         assert entry["detail"] == {name: alert[name] for name in entry["detail"]}
         assert client.get("history/journal?kind=alert&name=other").json()["entries"] == []
         assert client.get("history/journal?kind=song").status_code == 422
-        tag = client.get("history/journal").headers["ETag"]
-        assert client.get("history/journal", headers={"If-None-Match": tag}).status_code == 304
+        alerts = "history/journal?kind=alert"  # changes of the arrays' states may still come
+        tag = client.get(alerts).headers["ETag"]
+        assert client.get(alerts, headers={"If-None-Match": tag}).status_code == 304
 
 
 def test_alert_that_a_killed_server_left_in_the_outbox_is_in_the_journal_after_the_next_start(tmp_path: Path) -> None:
