@@ -121,10 +121,10 @@ def gather(site: Site, parts: Sequence[AssignedRecording], progress: Callable[[i
 def conclude(site: Site, gathered: Gathered) -> Examination:
     """Draw the conclusions from what was gathered."""
     findings = [*gathered.findings, *find_set_up_faults(site, gathered.sounds), *layout_findings(site)]
-    told = in_order(with_inputs(site, _without_consequences(findings)))
+    shown = in_order(with_inputs(site, _without_consequences(findings)))
     # the size of a blind spot is computed from the filed set-up, so it needs one without known faults
-    hidden = () if are_poses_in_doubt(told) else hidden_by(site, gathered.sounds)
-    return Examination(tuple(told), len(gathered.sounds), hidden)
+    hidden = () if are_poses_in_doubt(shown) else hidden_by(site, gathered.sounds)
+    return Examination(tuple(shown), len(gathered.sounds), hidden)
 
 
 def _without_consequences(findings: Sequence[Finding]) -> list[Finding]:

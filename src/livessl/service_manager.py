@@ -38,7 +38,7 @@ class ServiceManager:
     ----------
     clock : Clock
     address : str or None
-        Path of its socket, or `@` and an abstract name; None for nobody.
+        Path of its socket, or `@` and an abstract name; None without a service manager.
     silence_ns : int or None
         Time without a sign of life, in nanoseconds, after which it kills this process; None for no limit.
     """
@@ -125,7 +125,7 @@ class ServiceManager:
         try:
             return " ".join(describe().split())[:MAX_STATUS]
         except Exception:  # noqa: BLE001 - whatever fails there, the process is alive
-            _log.exception("the state for the service manager cannot be told")
+            _log.exception("the state of this process could not be described to the service manager")
             return self._status
 
     def _send(self, *lines: str) -> bool:

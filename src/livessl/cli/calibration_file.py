@@ -91,7 +91,7 @@ def _check_room(site: Site, arrays: Mapping[str, CalibratedArray]) -> None:
 
 
 def tell_server(arguments: argparse.Namespace, url: str | None, path: Path) -> None:
-    """Have the running server take over a calibration file that has changed, and tell the user whether it has.
+    """Have the running server take over a calibration file that has changed, and show the user whether it did.
 
     Parameters
     ----------

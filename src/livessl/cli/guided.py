@@ -41,14 +41,14 @@ def is_clear(sound: HeardSound) -> bool:
 def is_shared(sound: HeardSound) -> bool:
     """Return whether two arrays or more received a sound clearly, each with two channels or more."""
 
-    def tells(one: Observation) -> bool:
+    def is_clear(one: Observation) -> bool:
         return one.sharpness >= LEAST_SHARPNESS and np.isfinite(one.delays_s).sum() > 1
 
-    return sum(map(tells, sound.observations)) > 1
+    return sum(map(is_clear, sound.observations)) > 1
 
 
 def accepts_shared(sound: HeardSound) -> bool:
-    """Return whether a sound is shared, and tell the user if it is not."""
+    """Return whether a sound is shared, and show the user a message if it is not."""
     if not is_shared(sound):
         ask_for("  a sound that no two arrays received clearly; clap louder, or between them")
     return is_shared(sound)

@@ -186,7 +186,7 @@ def _open_when_there(
 
     clock = SystemClock()
     least = arguments.inputs or least
-    told: str | None = None
+    shown: str | None = None
     delivers = False
     while not limit.is_over:
         found = search_input(wanted_device(config, least))
@@ -194,7 +194,7 @@ def _open_when_there(
             usual = found.channels if found.is_hardware else max(least, min(found.channels, MOST_OF_SERVER))
             if arguments.site is None and arguments.sample_rate is None:
                 config = config.model_copy(update={"sample_rate_hz": found.default_sample_rate_hz})
-            if told is not None:
+            if shown is not None:
                 view.problem(None)
             return config, arguments.inputs or usual
         if delivers:  # it opens although no search finds it, such as with a library that lists it late
@@ -203,9 +203,9 @@ def _open_when_there(
         end_ns = clock.monotonic_ns() + round(SEARCH_S * 1e9)
         with SoundDevice(config, least, clock) as device:
             for block in device:
-                if device.problem is not None and device.problem != told:
-                    told = device.problem
-                    view.problem(told)
+                if device.problem is not None and device.problem != shown:
+                    shown = device.problem
+                    view.problem(shown)
                 has_cause = device.problem is not None and device.has_cause
                 if has_cause:
                     limit.begin(sounds=False)

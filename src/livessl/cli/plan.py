@@ -73,7 +73,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _refuse_foreign(out: Path, site: Path) -> None:
-    """Raise an error if the folder holds a plan or a picture of that name from somebody else."""
+    """Raise an error if the folder holds a plan or a picture of that name that another program has made."""
     keys = frozenset({"site", "rt60_s", "predicted_error", "advice"})
     option = f"--out {out}"
     refuse_foreign(option, [out / "plan.json"], lambda path: is_own_json(path, keys), site, "which is no complete plan")

@@ -99,7 +99,7 @@ def _serve_here(arguments: argparse.Namespace, site: Site, parts: Sequence[Assig
 
 
 def _private(site: Site, *, own_http: bool) -> Site:
-    """Return the site for a server that binds to this machine only, without keys, stores nothing, and alerts nobody.
+    """Return the site for a server that binds to this machine only, without keys, stores nothing, and raises no alerts.
 
     Keys and history belong to the site's real server. Unless the user named the site file (`own_http`), the HTTP
     settings of the session's own copy are dropped, too, because they were meant for another machine.

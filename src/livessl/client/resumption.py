@@ -160,7 +160,7 @@ def conversation(memory: Memory, wanted: Wanted, monotonic_s: Callable[[], float
     memory : Memory
     wanted : Wanted
     monotonic_s : callable
-        Returns seconds by a clock that nobody sets.
+        Returns seconds by a monotonic clock.
 
     Raises
     ------

@@ -23,7 +23,7 @@ SAME_PERIODS: Final = 0.125
 the band has lost a tenth of its height there. Microphones count as coplanar within the same share of a wavelength."""
 
 REACH_M: Final = 0.5
-"""Distance, in metres, up to which a mirror image outside the search volume counts as being on its surface: a position
+"""Distance, in metres, up to which a mirror image outside the search volume counts as being on its surface. A position
 may be off by that much, and its mirror image with it, so that the volume does not exclude the place."""
 
 CURE: Final = "let grid.bounds_m end at the plane, tilt an array, or raise a microphone"

@@ -99,7 +99,7 @@ class HubServer:
     hub : Hub
     clock : Clock
     service : ServiceManager or None
-        Gets reports; None for nobody.
+        Gets reports; None without a service manager.
 
     Raises
     ------

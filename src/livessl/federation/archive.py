@@ -185,7 +185,7 @@ class Archive:
     def _touch(
         self, connection: Connection, names: set[str], missing: Mapping[str, int], newest: Mapping[str, int]
     ) -> None:
-        """Note that sites were heard of now, how many messages are missing, and the starts of their newest events."""
+        """Note for sites that messages came now, how many are missing, and when their newest events began."""
         known = set(connection.execute(select(sites.c.site).where(sites.c.site.in_(names))).scalars())
         now_ns = self._clock.now_ns()
         rows = [

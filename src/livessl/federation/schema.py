@@ -51,7 +51,7 @@ class SiteState(BaseModel):
 
 
 class Sites(Versioned):
-    """All sites that the hub has heard of."""
+    """All sites from which a message or a report has come."""
 
     sites: list[SiteState]
 

@@ -86,7 +86,7 @@ class Interface:
     card : int
         Its number, as in `hw:CARD,0`.
     name, channels, rates_hz, ppm, serial, usb_port
-        What it is, and what it tells the kernel.
+        What the kernel is given about it.
     """
 
     folder: Path
@@ -106,7 +106,7 @@ class Interface:
         new.rename(self.folder / "control")
 
     def overrun(self) -> None:
-        """Make the driver lose samples, and say so."""
+        """Make the driver lose samples and report that."""
         self.control(f"xrun {next(self._numbers)}")
 
     def skip(self, milliseconds: float) -> None:

@@ -289,7 +289,7 @@ class _Disk(io.FileIO):
     def write(self, data: Any) -> int:
         try:
             written = super().write(data)
-            if written < len(data):  # the next write tells why
+            if written < len(data):  # the next write raises the reason
                 written += super().write(data[written:])
         except OSError as error:
             self.error = self.error or error

@@ -52,7 +52,7 @@ class AlertedFinding(Model):
 
 
 class OpenLinks(Model):
-    """Links that open what an alert shows without a token, for whoever has them, until they expire."""
+    """Links that open what an alert shows without a token until they expire."""
 
     picture: str | None = Field(description="Link to the picture; null if there is none, or the site gives none.")
     clip: str | None = Field(description="Link to the recording, once it is cut; null if the site gives none.")

@@ -247,7 +247,7 @@ class Event(Model):
     excluded: bool = Field(
         default=False,
         description="Whether its position lies in an excluded zone, or does with a probability of at least 0.5. It "
-        "alerts nobody.",
+        "raises no alert.",
         examples=[False],
     )
     excluded_by: list[str] = Field(default=[], description="Names of these zones.", examples=[[]])

@@ -59,7 +59,7 @@ class Server:
     read_site : callable or None
         Reads the site file again, for a reload; it raises `ConfigError` with all faults of the file.
     service : ServiceManager or None
-        Gets reports; None for nobody.
+        Gets reports; None without a service manager.
 
     Raises
     ------

@@ -48,7 +48,7 @@ class BusyError(RunError):
 
 @dataclass(frozen=True, slots=True)
 class Proposal:
-    """Poses that somebody may accept.
+    """Poses that an operator may accept.
 
     Parameters
     ----------
@@ -189,7 +189,7 @@ class Proposals:
         return self._keep(proposal, is_of_thread=is_of_thread)
 
     def typed(self, poses: Mapping[str, tuple[FloatArray, FloatArray]]) -> Proposal:
-        """Propose poses that somebody typed or dragged.
+        """Propose poses that were typed or dragged.
 
         Parameters
         ----------
@@ -214,7 +214,7 @@ class Proposals:
 
     @contextmanager
     def measuring(self) -> Iterator[None]:
-        """Hold the only place for a measurement that somebody waits for: each takes seconds of a core.
+        """Hold the only place for a measurement by request, each of which takes seconds of a core.
 
         Raises
         ------

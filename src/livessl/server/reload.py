@@ -200,8 +200,8 @@ class Reloader:
         with self._poses.unchanged():
             keys: list[str] = []
             try:
-                # the site was read before its rules were taken over, which takes seconds: somebody may have accepted
-                # other poses since
+                # the site was read before its rules were taken over, which takes seconds: other poses may have been
+                # accepted since
                 site = self._poses.calibrated(site)
                 keys = _keys_of_poses(self._poses.site, site, places)
                 if not keys:

@@ -125,8 +125,8 @@ class SetUpInForce:
             return _Prepared(now, [], ())
         faults = array_faults(now)
         if faults:
-            told = "; ".join(f"{dotted(where)}: {what}" for where, what in faults)
-            raise SetUpChangedError(f"{told}; if the room has changed as well, start the server again")
+            reasons = "; ".join(f"{dotted(where)}: {what}" for where, what in faults)
+            raise SetUpChangedError(f"{reasons}; if the room has changed as well, start the server again")
         return _Prepared(now, changed, tuple(follower(now) for follower in self._followers))
 
     def _bring_into_force(self, prepared: _Prepared) -> list[str]:

@@ -49,7 +49,7 @@ class SignOfLife:
                 has_complained = False
             except Exception:  # noqa: BLE001 - whatever fails there, the server is alive
                 if not has_complained:
-                    _log.exception("the condition for the service manager cannot be told")
+                    _log.exception("the condition of the server could not be described to the service manager")
                 has_complained = True
             await asyncio.sleep(DESCRIBE_S)
 

@@ -118,7 +118,7 @@ class SignedLinks:
             path = self._file
             stamp = None if path is None else file_stamp(path)
             if path is not None and stamp is None and self._stamp is not None:
-                self._stamp, self._key = None, secrets.token_bytes(SECRET_BYTES)  # somebody has deleted the file
+                self._stamp, self._key = None, secrets.token_bytes(SECRET_BYTES)  # the file was deleted
             if path is not None and (stamp != self._stamp or (makes and stamp is None)):
                 try:
                     self._read(path)

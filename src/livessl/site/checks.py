@@ -118,7 +118,7 @@ def _server_faults(site: Site) -> Iterator[Finding]:
     if site.privacy == "positions-only" and site.server.listen:
         yield (
             ("server", "listen"),
-            "with privacy: positions-only nobody may listen; remove it, or set privacy: recording",
+            "with privacy: positions-only listening is not allowed; remove it, or set privacy: recording",
         )
     if site.privacy == "positions-only" and site.server.clips is not None:
         yield (

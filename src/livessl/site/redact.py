@@ -45,7 +45,7 @@ def redacted(data: Any) -> tuple[Any, frozenset[str]]:
     """Return the data of a site file without secrets, and the texts that were taken out.
 
     Values are hidden whose key sounds like a secret, or a key above it; addresses keep their scheme and host alone, and
-    commands their program alone. Names of files stay unless their key sounds like a secret: nobody should have to know
+    commands their program alone. Names of files stay unless their key sounds like a secret, so that one need not know
     which key wants a file and which a password.
 
     Names of users and parts of paths and commands that are ordinary words, or stand elsewhere in what is shown, are not

@@ -80,7 +80,7 @@ def test_viewer_may_not_listen(tmp_path: Path) -> None:
 
 
 def test_positions_only_refuses_listening() -> None:
-    with pytest.raises(ConfigError, match=r"server\.listen: with privacy: positions-only nobody may listen"):
+    with pytest.raises(ConfigError, match=r"server\.listen: with privacy: positions-only listening is not allowed"):
         site_of({**LISTEN, "privacy": "positions-only"})
 
 

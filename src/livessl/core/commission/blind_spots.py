@@ -1,7 +1,7 @@
 """Says which faults of poses some sounds at unknown places could not have shown: shifts, turns, and a mirrored room.
 
 Two arrays whose lines of sight to a sound still meet after one of them was moved receive nothing that contradicts the
-site file: the place of the sound, which nobody knows, explains it. How much of a fault remains visible follows from the
+site file: the place of the sound is unknown and explains it. How much of a fault remains visible follows from the
 slopes of the delays, with the places of the sounds eliminated and every array as free as it is in a careful set-up.
 """
 

@@ -79,7 +79,7 @@ def find_clock_faults(recordings: Mapping[str, Rises]) -> Iterator[Finding]:
         for one, other in combinations(recordings, 2)
         if (difference := _difference(recordings[one], recordings[other])) is not None
     }
-    told: set[str] = set()
+    reported: set[str] = set()
     agreeing = {
         clock: sum(abs(one.later_s) < LEAST_OFF_S for pair, one in found.items() if clock in pair)
         for clock in recordings
@@ -90,9 +90,9 @@ def find_clock_faults(recordings: Mapping[str, Rises]) -> Iterator[Finding]:
         # the one with fewer friends is off; of two alike, the second one of the site file
         is_first = agreeing[one] < agreeing[other]
         off, right = (one, other) if is_first else (other, one)
-        if off in told:
+        if off in reported:
             continue
-        told.add(off)
+        reported.add(off)
         later_s = -difference.later_s if is_first else difference.later_s
         side = "ahead of" if later_s > 0.0 else "behind"
         message = (

@@ -27,7 +27,7 @@ from livessl.core.types import FloatArray, IntArray
 MIN_LEAD: Final = 6.0
 MIN_LEAD_OF_GAIN: Final = 0.06
 """Least lead of the best alternative over the best one about another array or channel, in deviance, and as a share of
-what the best one gains: if either explains much, the errors of the delays may be what distinguishes them."""
+what the best one gains. If both explain much, the errors of the delays may be what distinguishes them."""
 
 EQUAL: Final = 0.5
 """Share of `MIN_LEAD` within which alternatives explain the sounds equally well; if the gain is large,
@@ -35,8 +35,8 @@ EQUAL: Final = 0.5
 
 KNOWN_MIN_GAIN: Final = 12.0
 KNOWN_MIN_LEAD: Final = 6.0
-"""Least gain over the set-up as filed, and least lead over the other alternatives, for sounds at places that somebody
-measured; both in the Bayesian information criterion."""
+"""Least gain over the set-up as filed, and least lead over the other alternatives, for sounds at measured
+places; both in the Bayesian information criterion."""
 
 FLOOR_S: Final = 12e-6
 """Misfit, in seconds, that remains in a set-up that is filed as well as one can measure it: microphones to 2 mm, arrays
@@ -124,7 +124,7 @@ def diagnose(
 
 
 def verify(microphones: Microphones, delays: Delays, places_m: FloatArray, c_m_s: float) -> Diagnosis:
-    """Compare the set-up as filed with its alternatives, by sounds at places that somebody measured.
+    """Compare the set-up as filed with its alternatives, by sounds at measured places.
 
     One array is enough, and one sound shows whether something is wrong; three or four show what.
 

@@ -170,7 +170,7 @@ class PlaceSearch:
 
 
 class KnownPlaces(PlaceSearch):
-    """The places of sounds that were made where somebody measured: they are not searched for.
+    """The places of sounds that were made at measured places, which are not searched for.
 
     Parameters
     ----------

@@ -1,6 +1,6 @@
 """Explains delays by a set-up that may be off by as little as people measure, and says how well that works.
 
-Nobody places an array to better than a centimetre or two and a degree. A set-up as filed that is compared with
+Arrays are placed to within a centimetre or two and a degree at best. A set-up as filed that is compared with
 alternatives without that freedom always contradicts the sounds a little, and a small turn or shift of a wrong array
 explains it. So the set-up as filed and each alternative get the same freedom: arrays may be shifted and turned, each
 microphone may be elsewhere, and the speed of sound may differ, by as much as their standard deviations allow. What

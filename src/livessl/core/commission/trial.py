@@ -1,4 +1,4 @@
-"""Tries other set-ups than the one that is filed against the delays of sounds at places that somebody measured."""
+"""Tries other set-ups than the one that is filed against the delays of sounds at measured places."""
 
 from __future__ import annotations
 

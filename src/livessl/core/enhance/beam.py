@@ -26,7 +26,7 @@ from livessl.core.types import ArraySpec, BoolArray, Float32Array, FloatArray, r
 Method = Literal["delay-and-sum", "mvdr"]
 
 LOADING: Final = 1.0
-"""Power that is added to the diagonal of the noise covariance, as a share of its mean: it keeps the beam's white-noise
+"""Power that is added to the diagonal of the noise covariance, as a share of its mean. It keeps the beam's white-noise
 gain near that of delay-and-sum where few windows of quiet are known or the microphones are not quite in place."""
 
 PRIOR: Final = 0.5

@@ -135,8 +135,9 @@ class SearchCells(NamedTuple):
     cell_places: UInt16Array
     """Places for the cells of each cube: (T, site's pairs, per_cube^3)."""
     reaches: UInt8Array
-    """Index in `REACHES` of the most lags between the middle of a cell and any of its points, and of those between the
-    middle of any half, along each axis, and a point in that half: (2, T, per_cube^3, site's pairs)."""
+    """Index in `REACHES` of two numbers of lags: (2, T, per_cube^3, site's pairs). The first is the most between the
+    middle of a cell and any of its points, the second the most between the middle of any half, along each axis, and a
+    point in that half."""
 
 
 class SearchBounds(NamedTuple):

@@ -158,7 +158,7 @@ def _claim(out: Path, job: Job) -> None:
 
 
 def require_no_others(out: Path, names: Sequence[str]) -> None:
-    """Check that a folder holds none of some files, which nobody knows to be ours.
+    """Check that a folder holds none of some files, which might be those of another program.
 
     Raises
     ------

@@ -44,7 +44,7 @@ class Surroundings:
     traces : EventTraces or None
         Adds spans of alerts; None if nothing is traced.
     links : SignedLinks or None
-        Signs links for people without a token; None if nobody needs one.
+        Signs links for people without a token; None if every reader has one.
     """
 
     clock: Clock

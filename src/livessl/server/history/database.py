@@ -160,7 +160,7 @@ class Database:
                 raise
             except (SQLAlchemyError, KeyError, TypeError, ValueError) as error:  # the last ones: of a damaged old event
                 cure = CURE_OF_SERVER if self.is_remote else "name a file in a writable folder"
-                self._problem = f"server.events_db: cannot use {self.name}: {told(error)}; {cure}"
+                self._problem = f"server.events_db: cannot use {self.name}: {message_of(error)}; {cure}"
                 raise StoreError(self._problem) from error
             self._is_prepared = True
         return True
@@ -184,9 +184,9 @@ class Database:
             with self._turns, self._writing.begin() as connection:
                 yield connection
         except (DataError, IntegrityError) as error:
-            raise RejectedError(f"server.events_db: cannot {what}: {told(error)}") from error
+            raise RejectedError(f"server.events_db: cannot {what}: {message_of(error)}") from error
         except SQLAlchemyError as error:
-            raise StoreError(f"server.events_db: cannot {what}: {told(error)}; {self.cure}") from error
+            raise StoreError(f"server.events_db: cannot {what}: {message_of(error)}; {self.cure}") from error
 
     @contextmanager
     def reading(self) -> Iterator[Connection]:
@@ -212,7 +212,7 @@ class Database:
                 what = f"server.events_db: a search was ended after {STATEMENT_S:g} s"
                 raise StoreError(f"{what}; {NARROW}") from error
             cure = CURE_OF_SERVER if self.is_remote else UNLOCK
-            raise StoreError(f"server.events_db: cannot read: {told(error)}; {cure}") from error
+            raise StoreError(f"server.events_db: cannot read: {message_of(error)}; {cure}") from error
 
     @contextmanager
     def session(self) -> Iterator[Connection]:
@@ -228,7 +228,7 @@ class Database:
             with self._sessions.connect() as connection:
                 yield connection
         except SQLAlchemyError as error:
-            raise StoreError(f"server.events_db: cannot use {self.name}: {told(error)}; {self.cure}") from error
+            raise StoreError(f"server.events_db: cannot use {self.name}: {message_of(error)}; {self.cure}") from error
 
     def erase(self) -> None:
         """Remove deleted rows from an SQLite file's journal; PostgreSQL's own vacuum does it there.
@@ -245,7 +245,7 @@ class Database:
                 driver: Any = connection.connection.dbapi_connection  # outside of any transaction
                 busy, *_ = driver.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchone()
         except (SQLAlchemyError, sqlite3.Error) as error:
-            raise StoreError(f"server.events_db: old events were not erased: {told(error)}; {UNLOCK}") from error
+            raise StoreError(f"server.events_db: old events were not erased: {message_of(error)}; {UNLOCK}") from error
         if busy:
             raise StoreError(f"server.events_db: its journal was not emptied of old events; {UNLOCK}")
 
@@ -261,8 +261,8 @@ class Database:
         self._sessions.dispose()
 
 
-def told(error: Exception) -> str:
-    """Return what the driver says, in one line and without the statement."""
+def message_of(error: Exception) -> str:
+    """Return the message of the driver in one line, without the statement."""
     cause = error.orig if isinstance(error, DBAPIError) else error
     return " ".join(str(cause).split())
 
@@ -293,7 +293,7 @@ def upgrade(connection: Connection, migrations: Path = Path(__file__).parent / "
     try:
         command.upgrade(config, "head")
     except CommandError as error:
-        what = f"server.events_db: cannot migrate the database: {told(error)}"
+        what = f"server.events_db: cannot migrate the database: {message_of(error)}"
         raise StoreError(f"{what}; update livessl, or name another database") from error
 
 

@@ -37,7 +37,7 @@ def measured_arrays(site: Site, measured: MeasuredSetUp) -> dict[str, Calibrated
 
 
 def typed_arrays(site: Site, microphones: Mapping[str, FloatArray]) -> dict[str, CalibratedArray]:
-    """Return what is stored of arrays whose microphones (K, 3) somebody has set, metres.
+    """Return what is stored of arrays whose microphones (K, 3) were set by hand, in metres.
 
     Nothing is known of their accuracy; the site's uncertainty holds.
     """
