@@ -25,7 +25,7 @@ from livessl.core.locate.peak_search import PeakSearch
 from livessl.core.locate.srp import SRPMapper
 from livessl.core.types import Evidence, Float32Array
 from livessl.lab.bench.kernels import C_M_S, KINDS, PLACES_M, RATE_HZ, Blocks, array_specs
-from peers import room_grid
+from peer_maps import room_grid
 
 COUNTS: Final = (2, 3, 4, 6, 8)
 SPACINGS_M: Final = (0.1, 0.05)

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
+from growth import Fit
 from hub_sites import ARRAYS, EVENTS_PER_HOUR, MESSAGES_PER_HOUR, MIN_PACE
 from livessl.lab.evaluate.markdown import Block, Table, as_markdown
 from livessl.server.forwarding.link import REPORT_S
-from performance import Fit
 
 BEGIN: Final = "<!-- begin hub load -->\n"
 END: Final = "<!-- end hub load -->"

@@ -40,6 +40,11 @@ def alert_site(directory: Path | None = None, changes: Changes | None = None, **
     return site_of({"alerts": alerts, **(changes or {})}, directory)
 
 
+def kept_site(directory: Path | None = None, **rules: dict[str, Any]) -> Site:
+    """The small site with rules, and a history in the folder, if there is one."""
+    return alert_site(directory, {} if directory is None else {"server.events_db": "events.sqlite"}, rules=rules)
+
+
 def sound(
     number: int = 0,
     position_m: Sequence[float] | None = IN_DOOR,

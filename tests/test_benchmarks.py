@@ -14,9 +14,11 @@ import pytest
 
 import exactness
 import help_time
+import peer_maps
 import peers
-import performance
+import performance_page
 import startup
+from growth import Fit
 from livessl.clock import SystemClock
 from livessl.core.geometry import Grid
 from livessl.core.kernels import kernels as kernels_in_use
@@ -32,7 +34,7 @@ GRID: Final = Grid(((0.0, 8.0), (0.0, 10.0), (0.0, 4.0)), 1.0)
 
 
 @pytest.fixture(scope="module")
-def sounds() -> peers.Sounds:
+def sounds() -> peer_maps.Sounds:
     return kernels.Blocks(kernels.array_specs(2), sources=1).sound("voice", 0)
 
 
@@ -44,22 +46,22 @@ def test_kernels_are_timed_beside_bare_look_ups() -> None:
     assert report.kernels in ("numba", "NumPy")
 
 
-@pytest.mark.parametrize("name", peers.PEERS)
-def test_peer_maps_what_the_formula_does(name: str, sounds: peers.Sounds) -> None:
+@pytest.mark.parametrize("name", peer_maps.PEERS)
+def test_peer_maps_what_the_formula_does(name: str, sounds: peer_maps.Sounds) -> None:
     if name in ("acoular", "pyroomacoustics"):
         pytest.importorskip(name)
     specs, points_m = kernels.array_specs(2), GRID.points_m()
-    truth = peers.reference(specs, points_m)(sounds)
-    power = peers.PEERS[name](specs, points_m)(sounds)
+    truth = peer_maps.reference(specs, points_m)(sounds)
+    power = peer_maps.PEERS[name](specs, points_m)(sounds)
     assert np.corrcoef(power, truth)[0, 1] > 0.99
     assert power.argmax() == truth.argmax()
 
 
 @pytest.mark.parametrize("form", [with_numba, with_numpy])
-def test_ours_maps_what_the_formula_does(form: ModuleType, sounds: peers.Sounds) -> None:
+def test_ours_maps_what_the_formula_does(form: ModuleType, sounds: peer_maps.Sounds) -> None:
     """Nearest of eight lags a sample: an error of 1/28 sample RMS, 0.03 rad at 6 kHz; 1e-3 of the power."""
     specs = kernels.array_specs(2)
-    truth = peers.reference(specs, GRID.points_m())(sounds)
+    truth = peer_maps.reference(specs, GRID.points_m())(sounds)
     ours = peers.Ours(specs, GRID, form)
     power = ours.power(sounds)
     assert np.corrcoef(power, truth)[0, 1] > 0.999
@@ -87,13 +89,13 @@ def test_a_search_that_is_wrong_is_counted(monkeypatch: pytest.MonkeyPatch) -> N
 
 def test_fits_recover_what_they_are_given() -> None:
     x = [1.0, 2.0, 5.0, 20.0]
-    power = performance.Fit.power(x, [3.0 * one**1.7 for one in x])
+    power = Fit.power(x, [3.0 * one**1.7 for one in x])
     assert (power.factor, power.exponent) == pytest.approx((3.0, 1.7))
-    line = performance.Fit.line(x, [4.0 + 0.25 * one for one in x])
+    line = Fit.line(x, [4.0 + 0.25 * one for one in x])
     assert (line.offset, line.factor) == pytest.approx((4.0, 0.25))
     assert line(8.0) == pytest.approx(6.0)
     assert line.worst < 1e-9
-    assert performance.Fit.line([1.0, 2.0, 3.0], [1.0, 2.0, 4.0]).worst > 0.05
+    assert Fit.line([1.0, 2.0, 3.0], [1.0, 2.0, 4.0]).worst > 0.05
 
 
 MACHINE: Final = {
@@ -122,7 +124,7 @@ def live(arrays: int, clients: int, spin: bool) -> Json:
 
 def measured() -> dict[str, Json]:
     """What the benchmarks write, by file."""
-    codes = ["livessl, map, compiled", "livessl, search, compiled", *peers.PEERS]
+    codes = ["livessl, map, compiled", "livessl, search, compiled", *peer_maps.PEERS]
     side_by_side = [
         {"name": name, "spacing_m": spacing_m, "nodes": 2000, "timed_nodes": 2000, "ratio": 1234.5, "median_ms": 2.0}
         | {"correlation": None, "same_peaks": None}
@@ -174,8 +176,8 @@ def write(folder: Path, files: dict[str, Json]) -> Path:
 
 
 def test_text_is_made_of_the_files(tmp_path: Path) -> None:
-    runs = {performance._live_name(*demand): live(*demand) for demand in performance.LIVE}
-    text = performance.document(write(tmp_path, measured() | runs))
+    runs = {performance_page.live_name(*demand): live(*demand) for demand in performance_page.LIVE}
+    text = performance_page.document(write(tmp_path, measured() | runs))
     assert "540 of 540 maps" in text
     assert "takes 1.8 times what as many bare look-ups take on this machine, and 4.4 times without numba" in text
     assert "| the service's processor | arrays = 4, 8, 16, 32, 64 | 12.0 + 0.500 arrays % of a core | 0% |" in text
@@ -205,17 +207,17 @@ def test_help_is_timed() -> None:
 
 
 def test_text_without_the_service_says_so(tmp_path: Path) -> None:
-    assert "Not measured here." in performance.document(write(tmp_path, measured()))
+    assert "Not measured here." in performance_page.document(write(tmp_path, measured()))
 
 
 def test_text_wants_all_of_the_service_or_nothing(tmp_path: Path) -> None:
     folder = write(tmp_path, measured() | {"live-4-1": live(4, 1, False)})
     with pytest.raises(ValueError, match=r"live-4-20.json, .*live-64-20-spin.json lacking"):
-        performance.document(folder)
+        performance_page.document(folder)
 
 
 def test_files_of_two_machines_make_no_text(tmp_path: Path) -> None:
     files = measured()
     files["exactness"] = {**files["exactness"], "machine": {**MACHINE, "cpu": "Another"}}
     with pytest.raises(ValueError, match="of one machine"):
-        performance.document(write(tmp_path, files))
+        performance_page.document(write(tmp_path, files))

@@ -2,129 +2,20 @@
 
 from __future__ import annotations
 
-import socket
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import replace
+from collections.abc import Callable
 from itertools import groupby, islice
-from types import TracebackType
-from typing import Self
 
-import numpy as np
 import pytest
-import zmq
 
+from link_router import HELLO, HandClock, Router, connect, free_endpoint, linked, together
 from livessl import wire
 from livessl.capture.dealer import Dealer
 from livessl.capture.link import SILENT_NS, Link
-from livessl.capture.outbox import BACKLOG_FRAMES, LATE_NS
-from livessl.capture.spool import MEMORY_BYTES
+from livessl.capture.outbox import LATE_NS
 from livessl.clock import SystemClock
-from livessl.core.types import BackfillRequest, ChannelLevel, Frame, HostState, Mark, Message
+from livessl.core.types import Frame, Mark
 from livessl.server.receiver import Receiver
 from small_site import FIRST_FRAME_INDEX, frame, mark, site_of, wait_until
-
-HELLO = wire.Hello("lab-pc", "run-1", {"north": 16000.0, "south": 16000.0})
-
-
-class HandClock:
-    """A clock that the test sets."""
-
-    def __init__(self) -> None:
-        self.time_ns = 1_767_225_600_000_000_000
-
-    def now_ns(self) -> int:
-        return self.time_ns
-
-    def monotonic_ns(self) -> int:
-        return self.time_ns
-
-    def sleep_until_ns(self, time_ns: int) -> bool:
-        self.time_ns = max(self.time_ns, time_ns)
-        return True
-
-
-class Router:
-    """A server that only does what the test requests."""
-
-    def __init__(self, endpoint: str = "tcp://127.0.0.1:*") -> None:
-        self._context = zmq.Context()
-        self._socket = self._context.socket(zmq.ROUTER)
-        self._socket.setsockopt(zmq.LINGER, 0)
-        self._socket.bind(endpoint)
-        self.endpoint = self._socket.getsockopt_string(zmq.LAST_ENDPOINT)
-        self.got: list[wire.WireMessage] = []
-        self.peer = b""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._socket.close()
-        self._context.term()
-
-    def read(self) -> int:
-        """Read all messages that have arrived; return their number."""
-        before = len(self.got)
-        while self._socket.poll(2):
-            self.peer, data = self._socket.recv_multipart()
-            self.got.append(wire.decode(data))
-        return len(self.got) - before
-
-    def send(self, data: bytes) -> None:
-        self._socket.send_multipart([self.peer, data])
-
-    def ack(self, settled: int | None = None, **received: int) -> None:
-        """Acknowledge frames by number, and settle those before a number."""
-        frame_indices = {array: FIRST_FRAME_INDEX + number for array, number in received.items()}
-        self.send(
-            wire.encode(wire.Ack("run-1", frame_indices, None if settled is None else FIRST_FRAME_INDEX + settled))
-        )
-
-    def hellos(self) -> list[wire.Hello]:
-        return [message for message in self.got if isinstance(message, wire.Hello)]
-
-    def frames(self, array: str = "north") -> list[int]:
-        return [m.sequence for m in self.got if isinstance(m, Frame) and m.array == array]
-
-    def marks(self, array: str = "north") -> list[int]:
-        return [m.sequence for m in self.got if isinstance(m, Mark) and m.array == array]
-
-
-@contextmanager
-def linked(endpoint: str, clock: HandClock | SystemClock | None = None) -> Iterator[Link]:
-    link = Link(endpoint, HELLO, clock or SystemClock())
-    try:
-        yield link
-    finally:
-        link.close(bye=False)
-
-
-def together(link: Link, router: Router, condition: Callable[[], object], what: str) -> None:
-    """Serve link and router until the condition holds."""
-
-    def turn() -> object:
-        link.service()
-        router.read()
-        return condition()
-
-    wait_until(turn, what)
-
-
-def connect(link: Link, router: Router) -> None:
-    count = len(router.hellos())
-    together(link, router, lambda: len(router.hellos()) > count, "a greeting")
-    router.ack()
-    together(link, router, lambda: link.connected, "the connection")
-    together(link, router, lambda: len(router.hellos()) > count + 1, "the greeting with the backlog")
-
-
-def free_endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp://127.0.0.1:{probe.getsockname()[1]}"
 
 
 def test_node_may_start_before_the_server() -> None:
@@ -276,80 +167,6 @@ def test_mark_is_not_sent_after_later_frames() -> None:
     assert sound.sequence == 2
     assert not [m for m in dealer.sent if isinstance(m, Mark) and m.array == "north"]
     link.close(bye=False)
-
-
-def test_spool_is_bounded_and_dropped_frames_are_counted() -> None:
-    samples = np.zeros((16, wire.MAX_FRAME_SAMPLES), dtype=np.float32)
-    size = samples.nbytes
-    count = MEMORY_BYTES // size + 20
-    endpoint = free_endpoint()
-    with linked(endpoint) as link:
-        for k in range(1, count + 1):
-            link.send([Frame("north", k, k, k, 384_000.0, samples, 0.0, True)])
-        assert link.dropped + link.pending == count
-        assert 20 <= link.dropped <= 21
-        assert link.pending * size <= MEMORY_BYTES < (link.pending + 2) * size
-        with Router(endpoint) as router:
-            connect(link, router)
-            kept = list(range(link.dropped + 1, count + 1))  # the oldest were dropped
-
-            def all_taken() -> bool:
-                link.service()
-                if router.read() and router.frames():
-                    frame_indices = {"north": router.frames()[-1]}
-                    router.send(wire.encode(wire.Ack("run-1", frame_indices)))
-                return link.pending == 0
-
-            wait_until(all_taken, "the backlog")
-            assert router.frames() == kept
-
-
-def test_live_sound_goes_first_and_the_backlog_follows_in_order_of_time() -> None:
-    endpoint = free_endpoint()
-    kept = [frame(k) for k in range(1, 51)]
-    with linked(endpoint) as link:
-        link.send(kept)
-        with Router(endpoint) as router:
-            together(link, router, router.hellos, "a greeting")
-            router.ack()
-            together(link, router, lambda: link.connected, "the connection")
-            link.send([frame(51), frame(52)])
-            together(
-                link,
-                router,
-                lambda: len(router.frames()) == 2 + BACKLOG_FRAMES,
-                "live sound, and a part of the backlog",
-            )
-            assert router.hellos()[-1].backlog == {"north": (FIRST_FRAME_INDEX + 1, FIRST_FRAME_INDEX + 51)}
-            assert router.frames() == [*range(1, BACKLOG_FRAMES + 1), 51, 52] or router.frames()[:2] == [51, 52]
-            router.ack(north=10)
-            together(link, router, lambda: len(router.frames()) == 12 + BACKLOG_FRAMES, "ten more")
-            link.send([frame(53)])
-            together(link, router, lambda: 53 in router.frames(), "the live frame")
-            assert 27 not in router.frames()  # the live frame preceded the rest of the backlog
-            for k in (26, 42, 50):
-                router.ack(north=k)
-                together(link, router, lambda k=k: min(50, k + 16) in router.frames(), "more of the backlog")  # type: ignore[misc]
-            together(link, router, lambda: router.hellos()[-1].backlog == {}, "the greeting without backlog")
-            assert sorted(router.frames()) == list(range(1, 54))
-            router.ack(north=53)
-            together(link, router, lambda: link.pending == 0, "the acknowledgement")
-            assert link.kept == 53  # until it is settled
-            router.ack(settled=50, north=53)
-            together(link, router, lambda: link.kept == 4, "the settlement")
-
-
-def test_settled_frames_that_the_server_never_received_are_sent() -> None:
-    """The server may have settled without this node, and shall still receive its frames."""
-    endpoint = free_endpoint()
-    with linked(endpoint) as link:
-        link.send([frame(k) for k in range(1, 6)])
-        with Router(endpoint) as router:
-            together(link, router, router.hellos, "a greeting")
-            router.ack(settled=100)
-            together(link, router, lambda: len(router.frames()) == 5, "the frames")
-            router.ack(settled=100, north=5)
-            together(link, router, lambda: link.kept == 0, "the settlement")
 
 
 def test_refusal_lasts_until_the_server_accepts() -> None:
@@ -522,110 +339,6 @@ def test_link_works_while_the_clock_is_set_back() -> None:
                 together(link, router, lambda router=router: len(router.hellos()) == 2, "another greeting")  # type: ignore[misc]
             finally:
                 link.close(bye=False)
-
-
-def remembered(request: BackfillRequest) -> list[Message]:
-    return [
-        frame(0, frame_index=frame_index, array=request.array, active=False)
-        for frame_index in range(request.first, request.last + 1)
-    ]
-
-
-def test_requested_frames_are_sent_and_not_kept() -> None:
-    with Router() as router:
-        link = Link(router.endpoint, HELLO, SystemClock(), backfill=remembered)
-        connect(link, router)
-        assert not [
-            m for m in router.got if isinstance(m, wire.Hello) and m.answers
-        ]  # an older server would refuse the field
-        router.send(wire.encode(wire.Request("run-1")))
-        greets = [m for m in router.got if isinstance(m, wire.Hello)]
-        together(link, router, lambda: hellos(router) > len(greets), "another greeting")
-        last = [m for m in router.got if isinstance(m, wire.Hello)][-1]
-        assert last.answers
-        router.send(wire.encode(wire.Request("run-1", {"south": (700, 703)})))
-        together(link, router, lambda: len(sounds(router)) == 3, "the answer")
-        assert [(m.array, m.frame_index, m.sequence) for m in sounds(router)] == [
-            ("south", k, 0) for k in (700, 701, 702)
-        ]
-        assert link.kept == link.pending == 0
-        router.send(wire.encode(wire.Request("another run", {"south": (700, 703)})))
-        router.ack()
-        link.service()
-        router.read()
-        assert len(sounds(router)) == 3
-        link.close(bye=False)
-
-
-def hellos(router: Router) -> int:
-    return sum(isinstance(message, wire.Hello) for message in router.got)
-
-
-def sounds(router: Router) -> list[Frame]:
-    return [message for message in router.got if isinstance(message, Frame)]
-
-
-def test_another_server_is_not_assumed_to_know_requests() -> None:
-    clock = HandClock()
-    with Router() as router:
-        link = Link(router.endpoint, HELLO, clock, backfill=remembered)
-        connect(link, router)
-        before = hellos(router)
-        router.send(wire.encode(wire.Request("run-1")))
-        together(link, router, lambda: hellos(router) > before, "another greeting")
-        clock.time_ns += 2 * SILENT_NS
-        before = hellos(router)
-        together(link, router, lambda: hellos(router) > before, "a greeting after silence")
-        last = [message for message in router.got if isinstance(message, wire.Hello)][-1]
-        assert not last.answers
-        link.close(bye=False)
-
-
-def test_node_without_backfill_does_not_announce_answers() -> None:
-    with Router() as router:
-        link = Link(router.endpoint, HELLO, SystemClock())
-        connect(link, router)
-        router.send(wire.encode(wire.Request("run-1")))
-        router.ack()
-        together(link, router, lambda: link.connected, "an acknowledgement")
-        link.close(bye=False)
-    assert not any(message.answers for message in router.got if isinstance(message, wire.Hello))
-
-
-def newest_mark(router: Router) -> Mark:
-    return [message for message in router.got if isinstance(message, Mark)][-1]
-
-
-def test_sections_of_marks_are_sent_only_to_a_server_that_reads_them() -> None:
-    """Older servers refuse a mark with sections; one that replaces the first may be older."""
-    level = ChannelLevel(-40.0, -50.0, 0, None, None, None, None)
-    report = replace(mark(0), levels=(level,) * 4, host=HostState(True, "chrony"))
-    clock = HandClock()
-    with Router() as router:
-        link = Link(router.endpoint, HELLO, clock, backfill=remembered)
-
-        def sent() -> Mark:
-            before = len(router.marks())
-            link.send([report])
-            together(link, router, lambda: len(router.marks()) > before, "a mark")
-            return newest_mark(router)
-
-        connect(link, router)
-        assert sent() == mark(0)
-        router.send(wire.encode(wire.Welcome("another run", (wire.SECTIONS,))))
-        router.send(wire.encode(wire.Welcome("run-1", ("a later extension",))))
-        router.send(wire.encode(wire.Request("run-1")))  # answered by a greeting: what came before it was read
-        together(link, router, lambda: router.hellos()[-1].answers, "a greeting")
-        assert sent() == mark(0)
-        router.send(wire.encode(wire.Welcome("run-1", (wire.SECTIONS, "a later extension"))))
-        wait_until(lambda: sent() == report, "a mark with its sections")
-        clock.time_ns += 2 * SILENT_NS
-        before = hellos(router)
-        together(link, router, lambda: hellos(router) > before, "a greeting after silence")
-        router.ack()
-        together(link, router, lambda: link.connected, "an acknowledgement")
-        assert sent() == mark(0)
-        link.close(bye=False)
 
 
 def test_a_server_that_refuses_is_not_said_to_be_away(caplog: pytest.LogCaptureFixture) -> None:

@@ -6,7 +6,8 @@ from collections.abc import Callable
 from math import inf
 from pathlib import Path
 
-from world import Event, World
+from world import World
+from world_parts import Event
 
 Fault = Callable[[World], None]
 

@@ -8,62 +8,34 @@ from __future__ import annotations
 
 import asyncio
 import gc
-import json
 import os
-import random
-import socket
 import threading
 import time
-import urllib.request
 from collections import Counter
-from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
-from contextlib import asynccontextmanager
-from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, ClassVar, NamedTuple, Self
 from unittest.mock import patch
 
+from crowd import Crowd
 from mutation import mutated, originals
-from websockets.asyncio.client import ClientConnection, connect
-from websockets.exceptions import ConnectionClosed
-from world import START, Event, Microphones, Post, World
+from players import CLIP, HOUR, PLACES, SECOND, SLOT, SOUNDS, Player, rendered_sounds, sound_of
+from world import World
+from world_parts import START, Event, Post
 
-from clients import Listener, Log, open_client
 from livessl import wire
-from livessl.clock import UnpacedClock, utc_ns
-from livessl.core.types import FRAME_NS, Frame, Message
-from livessl.recordings.assign import AssignedRecording, make_pipelines
-from livessl.recordings.play import paced_messages
-from livessl.recordings.recording import MemoryRecording
+from livessl.clock import utc_ns
+from livessl.core.types import FRAME_NS, Message
 from livessl.server.app import Server
 from livessl.server.latency import Arrival
-from livessl.simulation.scene import make_scene, render
 from livessl.site.models import Site
-from small_site import HANG_S, RATE_HZ, hiss, site_of
-
-SECOND = 20
-HOUR = 3600 * SECOND
-SLOT = 60 * SECOND
-"""One sound in each, but for every eighth hour, which is quiet."""
+from small_site import HANG_S, RATE_HZ, site_of
 
 STRIDE = SECOND // 2
 """Intervals that pass at once in quiet."""
 
-CLIP = 5 * SECOND
-"""Longer than a sound's recording is, with the quiet at its end."""
-
-SOUNDS = 8
-"""Different ones, each at a place of its own."""
-
-PLACES = {
-    "a": ("north", [1.9, 1.0, 1.4]),
-    "b": ("south", [2.2, 4.1, 1.5]),
-    "c": ("east", [3.3, 2.6, 1.6]),
-    "d": ("west", [0.7, 2.3, 1.5]),
-}
-"""Nodes, each with an array and its place."""
 
 GROWTH = 0.05
 """Of the memory after the first hour, at most."""
@@ -74,8 +46,6 @@ REFERENCE_HOURS = 1.0
 AT_REST = 200
 """Frames that nodes keep at most while nobody is away: of the sound that goes on, and those on their way."""
 
-READERS = 3
-"""Clients that read everything."""
 
 RETENTION_S = 3600.0
 """Of events: so that what is kept of them is as much after an hour as after a day."""
@@ -112,85 +82,6 @@ class Sample(NamedTuple):
 
 
 Tell = Callable[[Sample], None]
-
-Heard = Mapping[int, Sequence[Frame]]
-"""What an array's node sends of a sound, by frame index since the sound's recording began."""
-
-
-def rendered_sounds(site: Site) -> list[dict[str, Heard]]:
-    """Each of the sounds as every array's node sends it."""
-    sounds: list[dict[str, Heard]] = []
-    for k in range(SOUNDS):
-        scene = make_scene(
-            site.room.size_m,
-            rt60_s=0.2,
-            sounds=[("burst", hiss(0.2 + 0.1 * k, 1, seed=k)[0])],
-            count=1,
-            sample_rate_hz=RATE_HZ,
-            c_m_s=site.c_m_s,
-            keep_away_m=[spec.centre_m for spec in site.specs],
-            seed=k,
-            lead_s=1.0,
-        )
-        heard: dict[str, Heard] = {}
-        for spec in site.specs:
-            samples = render(scene, spec.microphones_m, seed=k)
-            part = AssignedRecording(spec.name, MemoryRecording(spec.name, float(RATE_HZ), samples), 0, (1, 2, 3, 4))
-            heard[spec.name] = _by_interval(site, part)
-        sounds.append(heard)
-    return sounds
-
-
-def _by_interval(site: Site, part: AssignedRecording) -> dict[int, list[Frame]]:
-    found: dict[int, list[Frame]] = {}
-    run_up: list[Frame] = []
-    for _, batch in paced_messages(*make_pipelines(site, [part]), UnpacedClock()):
-        for message in batch:
-            if isinstance(message, Frame):
-                run_up.append(message)
-                if message.active or message.frame_index - 1 in found:
-                    found[message.frame_index], run_up = run_up, []
-    return found
-
-
-@dataclass
-class Player(Microphones):
-    """An array in a room where the rendered sounds come again and again."""
-
-    sounds: Sequence[Mapping[str, Heard]] = ()
-    sent: Counter[str] = field(default_factory=Counter)
-
-    def messages_at(self, frame_index: int) -> list[Message]:
-        messages = self._heard(frame_index)
-        self.sent.update(type(message).__name__ for message in messages)
-        return messages
-
-    def _heard(self, frame_index: int) -> list[Message]:
-        slot, since = divmod(frame_index - START, SLOT)
-        played = sound_of(slot, len(self.sounds))
-        if played is None:
-            return super().messages_at(frame_index)
-        began = frame_index - since + played[0]
-        frames = self.sounds[played[1]][self.array].get(frame_index - began, ())
-        if not frames:
-            return super().messages_at(frame_index)
-        messages: list[Message] = []
-        for frame in frames:
-            self.sequence += 1
-            at = frame.frame_index + began
-            messages.append(
-                replace(frame, sequence=self.sequence, frame_index=at, time_ns=frame.time_ns + began * FRAME_NS)
-            )
-        return messages
-
-
-@lru_cache(maxsize=8)
-def sound_of(slot: int, count: int) -> tuple[int, int] | None:
-    """When in its slot a sound's recording begins, in intervals, and which it is."""
-    if slot * SLOT // HOUR % 8 == 7:
-        return None
-    rng = random.Random(slot)
-    return rng.randrange(SLOT // 2), rng.randrange(count)
 
 
 class _Post(Post):
@@ -338,133 +229,6 @@ class Soak(World):
                     self.start_node(name)
                 case _ if name in self.wires:
                     self.wires[name].up.extend((self.clock.time_ns, mutated(self.rng, pool)) for _ in range(100))
-
-
-class _Reader(Listener):
-    """Counts events."""
-
-    def __init__(self, heard: Counter[str]) -> None:
-        super().__init__(Log())
-        self._heard = heard
-
-    def note(self, data: bytes, body: int, length: int, now_ns: int) -> None:
-        self._heard["messages"] += 1
-        self._heard["events"] += data.startswith(b'"kind":"event"', data.find(b'"kind"', body))
-
-
-class Crowd:
-    """Clients in a thread of their own: some that read, one that stalls, one that comes and goes, one that asks.
-
-    Parameters
-    ----------
-    url : str
-        The server's.
-    """
-
-    def __init__(self, url: str) -> None:
-        host, port = url.removeprefix("http://").split(":")
-        self._address = host, int(port)
-        self._url = url
-        self._live = f"ws{url.removeprefix('http')}/api/v1"
-        self.heard: Counter[str] = Counter()
-        self._connections: set[ClientConnection] = set()
-        self._ended = threading.Event()
-        self._failures: list[Exception] = []
-        works = (self._listen, self._poll)
-        self._threads = [threading.Thread(target=self._watched, args=[work], daemon=True) for work in works]
-
-    def __enter__(self) -> Self:
-        for thread in self._threads:
-            thread.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._ended.set()
-        for thread in self._threads:
-            thread.join(timeout=HANG_S)
-        if self._failures and kind is None:
-            raise ExceptionGroup("clients failed", self._failures)
-
-    def _watched(self, work: Callable[[], None]) -> None:
-        try:
-            work()
-        except Exception as failure:  # noqa: BLE001 - whatever it is, the run shall fail by it
-            self._failures.append(failure)
-
-    def _listen(self) -> None:
-        asyncio.run(self._listen_all())
-
-    async def _listen_all(self) -> None:
-        loop = asyncio.get_running_loop()
-        readers = [open_client(*self._address, None, "update,event,track,arrays") for _ in range(READERS)]
-        listeners = [(await loop.create_connection(lambda: _Reader(self.heard), sock=each))[1] for each in readers]
-        tasks = [asyncio.create_task(work) for work in (self._watch_map(), self._come_and_go(), self._stall())]
-        while not self._ended.is_set():
-            await asyncio.sleep(0.1)
-            for task in tasks:
-                if task.done():
-                    task.result()  # nobody ends before the others
-        for listener in listeners:
-            listener.close()
-        await asyncio.gather(*(each.close() for each in self._connections))
-        await asyncio.gather(*tasks)
-
-    async def _watch_map(self) -> None:
-        async with self._connected(f"{self._live}/map") as connection:
-            async for _ in connection:
-                self.heard["maps"] += 1
-
-    async def _come_and_go(self) -> None:
-        address = f"{self._live}/live"
-        while not self._ended.is_set():
-            async with self._connected(address) as connection:
-                try:
-                    for _ in range(20):
-                        seq = json.loads(await connection.recv()).get("seq")
-                        address = address if seq is None else f"{self._live}/live?since_seq={seq}"
-                    self.heard["visits"] += 1
-                except ConnectionClosed:
-                    self.heard["visits cut"] += 1
-            await asyncio.sleep(2.0)
-
-    @asynccontextmanager
-    async def _connected(self, address: str) -> AsyncIterator[ClientConnection]:
-        async with connect(address, compression=None, ping_interval=None) as connection:
-            self._connections.add(connection)
-            try:
-                yield connection
-            finally:
-                self._connections.discard(connection)
-
-    async def _stall(self) -> None:
-        while not self._ended.is_set():
-            with await asyncio.to_thread(open_client, *self._address, 4096) as lazy:
-                while not (_hung_up(lazy) or self._ended.is_set()):
-                    await asyncio.sleep(0.2)
-            self.heard["stalled clients"] += 1
-
-    def _poll(self) -> None:
-        asked = ["health", "arrays", "events?limit=200", "tracks", "map", "../../metrics", "openapi.json"]
-        for k in range(10**9):
-            address = f"{self._url}/api/v1/{asked[k % len(asked)]}".replace("/api/v1/../..", "")
-            with urllib.request.urlopen(address) as answer:
-                answer.read()
-            self.heard["answers"] += 1
-            if self._ended.wait(4.0):
-                return
-
-
-def _hung_up(connection: socket.socket) -> bool:
-    """Whether the server has cut it; what it sent stays unread."""
-    try:
-        connection.send(b"")
-        return connection.recv(1, socket.MSG_PEEK) == b""
-    except BlockingIOError:
-        return False
-    except ConnectionError:
-        return True
 
 
 def resident_mb() -> float:

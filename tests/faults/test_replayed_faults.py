@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 from scenarios import HARMLESS, difference, links_narrow, nodes_killed, undisturbed
-from world import Event, World
+from world import World
+from world_parts import Event
 
 SEEDS = range(2)  # `benchmarks/faults.py` plays hundreds
 

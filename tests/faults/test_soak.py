@@ -10,7 +10,8 @@ from typing import Final
 from unittest.mock import patch
 
 import pytest
-from soak import GROWTH, READERS, Outcome, soak
+from crowd import READERS
+from soak import GROWTH, Outcome, soak
 
 from livessl.core.stream.final_pass import FinalResults, TwoPassFusion
 from livessl.core.types import Message, Output

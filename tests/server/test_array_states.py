@@ -8,7 +8,7 @@ from itertools import pairwise
 from typing import Any
 
 import pytest
-from world import START, HandClock
+from world_parts import START, HandClock
 
 from livessl import wire
 from livessl.core.types import FRAME_NS, ChannelLevel, HostState

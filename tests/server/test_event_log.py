@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from world import START, HandClock
+from world_parts import START, HandClock
 
 from livessl.core.stream.final_pass import FinalResults
 from livessl.core.types import FRAME_NS, Estimate, Event, Status

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from world import START, World
+from world import World
+from world_parts import START
 
 from livessl import wire
 from livessl.core.types import FRAME_NS, Track, TrackState

@@ -10,7 +10,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from world import HandClock
+from world_parts import HandClock
 
 from alert_desk import sound
 from livessl.core.commission.blind_spot import BlindSpot

@@ -6,8 +6,8 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 import pytest
-from test_fusion import HANG_OVER, START, Arrivals, frame, mark, node, now_ns, state_of
 
+from fusion_steps import HANG_OVER, START, Arrivals, frame, mark, node, now_ns, state_of
 from livessl.core.stream.array_health import LOST_NS
 from livessl.core.stream.final_pass import FinalResults, TwoPassFusion
 from livessl.core.stream.held_frames import HEADER_BYTES, HOLD_BYTES, HOLD_NS

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 import pytest
 from test_final_pass import both, play, provisional, settled_events, two_passes
-from test_fusion import NORTH, SOUTH, Scripted, mark, node, now_ns
 
+from fusion_steps import NORTH, SOUTH, Scripted, mark, node, now_ns
 from livessl.core.locate.estimator import Localization, Sound
 from livessl.core.stream.site_state import ArraySetUp
 from livessl.core.types import FRAME_NS, Event, Frame

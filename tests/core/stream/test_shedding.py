@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_fusion import NORTH, NOTHING, SOURCE_M, START, Scripted, frame, mark, now_ns, state_of, told
 
+from fusion_steps import NORTH, NOTHING, SOURCE_M, START, Scripted, frame, mark, now_ns, state_of, told
 from livessl.core.correlate.onset_gcc import OnsetGCC
 from livessl.core.locate.estimator import Localization, Sound
 from livessl.core.stream.final_pass import FinalResults, TwoPassFusion
