@@ -36,3 +36,8 @@ def _event() -> JsonObject:
 def _update() -> JsonObject:
     update = Update("small-1", Status.LOCATED, ESTIMATE, power=0.01)
     return Messages(site_of(), START_NS, utc=True).update(update)
+
+
+def small_event(number: int, **changes: object) -> JsonObject:
+    """The event of the small site with a number as its id."""
+    return event_message(id=f"small-{number}", **changes)

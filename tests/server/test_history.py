@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import sqlite3
 from collections.abc import Callable
@@ -13,117 +12,18 @@ from threading import Event as Flag
 from threading import Thread
 
 import pytest
-from alembic.autogenerate import compare_metadata
-from alembic.migration import MigrationContext
-from alembic.script import ScriptDirectory
 from sqlalchemy import Connection, text
 
 from livessl.errors import ConfigError
-from livessl.server.api.encode import JsonObject
 from livessl.server.history import backlog as backlog_module
-from livessl.server.history import database, migrations
+from livessl.server.history import database
 from livessl.server.history.backlog import MAX_UNSAVED, RETRY_NS, Backlog, Write
-from livessl.server.history.tables import metadata
 from livessl.server.store import Query, Store, StoreError
-from messages import event_message
+from messages import small_event
 from postgresql import PostgreSQL, running_postgresql
 from small_site import HANG_S, site_of, wait_until
 
-DAY_NS = 86_400_000_000_000
-OLD_TABLES = (
-    "CREATE TABLE events (number INTEGER PRIMARY KEY AUTOINCREMENT, id TEXT UNIQUE, time_ns INTEGER, "
-    "confidence REAL, json TEXT)",
-    "CREATE INDEX events_time ON events (time_ns)",
-    "CREATE TABLE provisional (id TEXT PRIMARY KEY)",
-    "CREATE TABLE settled (site TEXT PRIMARY KEY, raster INTEGER)",
-    "CREATE TABLE disabled (site TEXT, array TEXT, PRIMARY KEY (site, array))",
-    "CREATE TABLE clocks (site TEXT PRIMARY KEY, json TEXT)",
-)
-"""The tables of a file of the release before migrations existed."""
-
-
 FOREVER = "WITH RECURSIVE n(k) AS (SELECT 1 UNION ALL SELECT k + 1 FROM n) SELECT count(*) FROM n"
-
-
-def event(number: int, **changes: object) -> JsonObject:
-    return event_message(id=f"small-{number}", **changes)
-
-
-def write_old_file(path: Path, events: list[JsonObject]) -> None:
-    """Write what the release before migrations wrote; event number k began on day k and has the number 10 k + 1."""
-    with closing(sqlite3.connect(path)) as db, db:
-        for sql in OLD_TABLES:
-            db.execute(sql)
-        for k, each in enumerate(events):
-            row = (10 * k + 1, each["id"], k * DAY_NS, each["confidence"], json.dumps(each))
-            db.execute("INSERT INTO events VALUES (?, ?, ?, ?, ?)", row)
-        db.execute("INSERT INTO provisional VALUES ('small-4')")
-        db.execute("INSERT INTO settled VALUES ('lab', 1000), ('hall', 7)")
-        db.execute("INSERT INTO disabled VALUES ('lab', 'north')")
-        db.execute("INSERT INTO clocks VALUES ('lab', '{\"b\": 0.15}')")
-
-
-@pytest.mark.parametrize("batch", [2, 2000])
-def test_older_file_is_migrated_without_loss(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, batch: int) -> None:
-    monkeypatch.setattr(migrations, "BATCH", batch)
-    refused: JsonObject = {
-        "position_m": None,
-        "covariance_m2": None,
-        "status": "refused",
-        "confidence": 0.0,
-        "zones": [],
-    }
-    events = [event(k, zones=["Tür"] if k % 2 else [], reason="größer") for k in range(4)] + [event(4, **refused)]
-    write_old_file(tmp_path / "events.db", events)
-    for _ in range(2):  # the second time there is nothing to migrate
-        store = Store(tmp_path / "events.db")
-        assert store.find(Query())[0] == events[::-1]
-        assert [cursor.number for cursor in (row.cursor for row in store.page(Query()).rows)] == [41, 31, 21, 11, 1]
-        assert [found["id"] for found in store.find(Query(zone="Tür"))[0]] == ["small-3", "small-1"]
-        assert [found["id"] for found in store.find(Query(status="refused"))[0]] == ["small-4"]
-        assert len(store.find(Query(array=events[0]["arrays"][0]))[0]) == 5
-        assert len(store.find(Query(text="GRÖSSER".replace("SS", "ß")))[0]) == 4
-        assert store.early_events() == [(4 * DAY_NS, events[4])]
-        assert store.finalized("lab") == (1000, {"b": 0.15})
-        assert store.finalized("hall") == (7, None)
-        assert store.disabled("lab") == {"north"}
-        assert store.count() == 5
-        store.close()
-
-
-def test_migration_that_fails_leaves_the_older_file_as_it_was(tmp_path: Path) -> None:
-    path = tmp_path / "events.db"
-    write_old_file(path, [event(0), event(1)])
-    with closing(sqlite3.connect(path)) as db, db:
-        db.execute("UPDATE events SET json = NULL, confidence = NULL WHERE number = 11")
-        before = list(db.iterdump())
-    with pytest.raises(StoreError, match=r"cannot use .*events.db: .* NoneType"):
-        Store(path)
-    with closing(sqlite3.connect(path)) as db:
-        assert list(db.iterdump()) == before
-
-
-def test_migrations_make_the_tables_that_the_code_names(opened: Callable[[], Store]) -> None:
-    store = opened()
-    with store.database.reading() as connection:
-
-        def is_made_here(_thing: object, name: str | None, *_: object) -> bool:
-            return name != "event_tags_search" or connection.dialect.name == "postgresql"
-
-        options = {"compare_type": True, "include_object": is_made_here}
-        assert compare_metadata(MigrationContext.configure(connection, opts=options), metadata) == []
-
-
-def test_the_newest_migration_is_the_one_that_the_code_expects() -> None:
-    assert ScriptDirectory(str(Path(database.__file__).parent / "migrations")).get_current_head() == database.HEAD
-
-
-def test_database_of_a_newer_release_is_refused(tmp_path: Path) -> None:
-    Store(tmp_path / "events.db").close()
-    with closing(sqlite3.connect(tmp_path / "events.db")) as db, db:
-        db.execute("UPDATE alembic_version SET version_num = '9000'")
-    with pytest.raises(StoreError, match=r"got 9000 of a newer livessl; update livessl, or name another database"):
-        Store(tmp_path / "events.db")
 
 
 def test_server_that_comes_late_gets_what_waited(caplog: pytest.LogCaptureFixture) -> None:
@@ -140,13 +40,13 @@ def test_server_that_comes_late_gets_what_waited(caplog: pytest.LogCaptureFixtur
                 with pytest.raises(StoreError, match="see that PostgreSQL runs"):
                     read()
             store.backlog.start()
-            store.backlog.put(Write(lambda: store.finalize("lab", [(event(1), 0)], [], 5, {}), 1, True), 0)
+            store.backlog.put(Write(lambda: store.finalize("lab", [(small_event(1), 0)], [], 5, {}), 1, True), 0)
             wait_until(lambda: store.backlog.is_failing, "a failure")
             assert (store.backlog.unsaved, store.backlog.is_saved) == (1, False)
             server.start()
             wait_until(lambda: store.backlog.is_saved, "the event to be stored")
             assert ready.is_set()
-            assert store.find(Query())[0] == [event(1)]
+            assert store.find(Query())[0] == [small_event(1)]
             _go_down_and_come_back(server, store)
         finally:
             store.close()
@@ -156,7 +56,7 @@ def _go_down_and_come_back(server: PostgreSQL, store: Store) -> None:
     """What is put while the server is down is stored in order when it is there again."""
     server.stop()
     for k in range(2, 30):
-        store.backlog.put(Write(lambda k=k: store.add(event(k % 20, duration_s=float(k)), k), 1, False), 0)  # type: ignore[misc]
+        store.backlog.put(Write(lambda k=k: store.add(small_event(k % 20, duration_s=float(k)), k), 1, False), 0)  # type: ignore[misc]
     wait_until(lambda: store.backlog.is_failing, "a failure")
     with pytest.raises(StoreError):
         store.find(Query())
@@ -174,8 +74,8 @@ def test_readers_see_what_was_put_before_they_asked(opened: Callable[[], Store])
     store = opened()
     store.backlog.start()
     for k in range(50):
-        store.backlog.put(Write(lambda k=k: store.add(event(k), k), 1, False), 0)  # type: ignore[misc]
-        assert store.get(f"small-{k}") == event(k)
+        store.backlog.put(Write(lambda k=k: store.add(small_event(k), k), 1, False), 0)  # type: ignore[misc]
+        assert store.get(f"small-{k}") == small_event(k)
 
 
 def test_event_that_the_database_refuses_holds_up_no_other(
@@ -184,7 +84,7 @@ def test_event_that_the_database_refuses_holds_up_no_other(
     """PostgreSQL's texts cannot hold NUL."""
     store = Store(postgresql.url())
     for name in ("small-1", "small\0-2", "small-3"):
-        store.backlog.put(Write(lambda name=name: store.add(event_message(id=name), 0), 1, False), 0)  # type: ignore[misc]
+        store.backlog.put(Write(lambda name=name: store.add({**small_event(0), "id": name}, 0), 1, False), 0)  # type: ignore[misc]
     assert [found["id"] for found in store.find(Query())[0]] == ["small-3", "small-1"]
     assert (store.backlog.unkept, store.backlog.unsaved) == (1, 0)
     assert "cannot store event 'small\\x00-2'" in caplog.text
@@ -243,14 +143,14 @@ def test_what_waits_for_the_database_may_put_more(tmp_path: Path, *, runs: bool)
     def work() -> None:
         if next(tries) == 0:
             raise StoreError("the database is not there yet")
-        store.backlog.put(Write(lambda: store.add(event(1), 1), 1, False), 0)
+        store.backlog.put(Write(lambda: store.add(small_event(1), 1), 1, False), 0)
         assert store.get("small-1") is None  # no wait for what this thread is to write
 
     def put() -> None:
         store.when_ready(work)
         if runs:
             store.backlog.start()
-        store.backlog.put(Write(lambda: store.add(event(2), 2), 1, False), 0)
+        store.backlog.put(Write(lambda: store.add(small_event(2), 2), 1, False), 0)
         store.backlog.retry(RETRY_NS)
 
     putting = Thread(target=put, daemon=True)
@@ -319,8 +219,8 @@ def check_long_search(place: Path | str | None, monkeypatch: pytest.MonkeyPatch)
         store.database.reading() as connection,
     ):
         connection.execute(text(FOREVER))
-    store.add(event(1), 0)
-    assert store.get("small-1") == event(1)
+    store.add(small_event(1), 0)
+    assert store.get("small-1") == small_event(1)
     store.close()
 
 
@@ -341,7 +241,7 @@ def test_search_in_memory_limits_no_write_after_it(monkeypatch: pytest.MonkeyPat
 def test_events_of_before_the_journal_are_found_by_their_exclusion(place: Path | str) -> None:
     """The database is of the revision before: no journal, and no tags of excluded events."""
     store = Store(place)
-    store.add_all([(event(number) | {"excluded": number == 2}, number) for number in range(4)])
+    store.add_all([(small_event(number) | {"excluded": number == 2}, number) for number in range(4)])
     with store.database.writing("go back") as connection:
         for sql in (
             "DELETE FROM event_tags WHERE kind = 'flag'",
@@ -374,7 +274,7 @@ def test_reader_sees_one_state(opened: Callable[[], Store]) -> None:
     store, count_all = opened(), text("SELECT count(*) FROM events")
     with store.database.reading() as connection:
         assert connection.execute(count_all).scalar() == 0
-        store.add(event(1), 0)
+        store.add(small_event(1), 0)
         assert connection.execute(count_all).scalar() == 0
 
 
@@ -407,7 +307,7 @@ def test_who_writes_all_the_time_keeps_out_nobody(tmp_path: Path) -> None:
 
     def write() -> None:
         for k in count():
-            store.add(event(k % 100), k)
+            store.add(small_event(k % 100), k)
             if done.is_set():
                 return
 
