@@ -8,23 +8,20 @@ from typing import Final
 
 import numpy as np
 
-from livessl.core.correlate.gcc_phat import LagSampling, require_band
-from livessl.core.correlate.onset_gcc import OnsetFrontEnd, OnsetGCC, has_long_windows, summed
-from livessl.core.geometry import Grid, microphone_pairs
+from livessl.core.correlate.onset_gcc import OnsetFrontEnd
+from livessl.core.geometry import Grid
 from livessl.core.locate import ambiguity, outliers
-from livessl.core.locate.background import background_lags, loud_frames
-from livessl.core.locate.beginning import beginning, first_frame
 from livessl.core.locate.confidence import (
     CROSSING_DEG,
     LEAST_CONFIDENCE,
     NEAR_M,
     Judgement,
-    background_power,
 )
-from livessl.core.locate.contributing import FAINT, NO_EVIDENCE, contributing
+from livessl.core.locate.contributing import NO_EVIDENCE, contributing
 from livessl.core.locate.estimator import Localization, Sound, strongest_onsets
 from livessl.core.locate.frame_gccs import FrameGCCs
 from livessl.core.locate.map_estimator import MapEstimator, map_grid
+from livessl.core.locate.onset_evidence import OnsetEvidence, without_background
 from livessl.core.locate.outliers import Consensus
 from livessl.core.locate.outside import Outside, find_outside
 from livessl.core.locate.peak_search import PeakSearch
@@ -33,7 +30,7 @@ from livessl.core.locate.second_source import SecondSourceSearch
 from livessl.core.locate.srp import SRPFunctional
 from livessl.core.locate.tolerant import tolerant
 from livessl.core.methods import ONSET
-from livessl.core.types import GCC, ArraySpec, Evidence, Float32Array
+from livessl.core.types import ArraySpec, Evidence
 
 SEARCH_SPACING_M: Final = 0.1
 """Coarsest spacing of the search grid, in metres. Within 0.1 m the phase of a 0.5 m array at 6 kHz changes by less than
@@ -105,7 +102,7 @@ class Onset(MapEstimator):
         self._map_grid = map_grid(arrays, grid)
         self._search = PeakSearch(arrays, self.grid, c_m_s)
         self._second_source = SecondSourceSearch(self._search, self.grid, c_m_s)
-        self._samplings: dict[str, tuple[float, LagSampling]] = {}
+        self._onsets = OnsetEvidence(self.arrays, c_m_s, self._search.prepare)
 
     def prepare(self, array: str, sample_rate_hz: float) -> None:
         """Compute an array's tables for a sampling rate.
@@ -115,11 +112,11 @@ class Onset(MapEstimator):
         ValueError
             If the rate is too low for the array's band.
         """
-        self._sampling(array, sample_rate_hz)
+        self._onsets.sampling(array, sample_rate_hz)
 
     def onset_front_end(self, array: str, sample_rate_hz: float) -> OnsetFrontEnd:
         """Return a new front end for an array's frames."""
-        return OnsetFrontEnd(self.arrays[array], sample_rate_hz, self._sampling(array, sample_rate_hz))
+        return self._onsets.front_end(array, sample_rate_hz)
 
     def locate(self, sounds: Mapping[str, Sound]) -> Localization:
         """Find the place that most arrays agree on, then a second source, and judge both.
@@ -137,15 +134,22 @@ class Onset(MapEstimator):
         suspect = [name for name, sound in strongest.items() if sound.suspect]
         evidence, answer = self._beneath_background(evidence, suspect, tolerance=is_thorough)
         if looks_again and not answer.is_sure:
-            loud = self._loud(evidence, strongest)
+            loud = self._onsets.of_loud(evidence, strongest)
             if loud is not None:
                 _, by_loud = self._beneath_background(loud, suspect, tolerance=is_thorough)
                 answer = max(answer, by_loud, key=_Answer.rank)
         outside = self._outside(answer)
         separation = None
+
+        def frames(part: Evidence) -> FrameGCCs:
+            return self._onsets.frames(part, strongest[part.spec.name])
+
         if outside is None or not outside.is_sufficient:
             separation = self._second_source.separate(
-                answer.consensus, answer.evidence, strongest, lambda part: self._frames(part, strongest[part.spec.name])
+                answer.consensus,
+                answer.evidence,
+                strongest,
+                lambda part: self._onsets.frames(part, strongest[part.spec.name]),
             )
         others: tuple[Localization, ...] = ()
         if separation is not None:
@@ -172,7 +176,7 @@ class Onset(MapEstimator):
         """
         answer = self._answer(evidence, suspect, tolerance=tolerance)
         if answer.judgement.features.background >= BACKGROUND:
-            beneath = self._without_background(evidence, answer.consensus.place)
+            beneath = without_background(evidence, answer.consensus.place, self.c_m_s)
             other = self._answer(beneath, suspect, tolerance=tolerance)
             if other.refused is None and other.rank() > answer.rank():
                 evidence, answer = beneath, other
@@ -192,26 +196,9 @@ class Onset(MapEstimator):
         lead = other.judgement.features.peak_to_rms - features.beginning
         return other if other.refused is None and apart_m > NEAR_M and lead > LEAD else answer
 
-    def _loud(self, evidence: Sequence[Evidence], sounds: Mapping[str, Sound]) -> tuple[Evidence, ...] | None:
-        """Return the evidence of loud frames alone, where a background is known; None if that is the same."""
-        loud = {part.spec.name: loud_frames(sounds[part.spec.name]) for part in evidence}
-        if not any(loud.values()):
-            return None
-
-        def of_loud(part: Evidence) -> Evidence:
-            name = part.spec.name
-            if not loud[name]:
-                return part
-            sound, onsets = sounds[name], summed([sounds[name].onsets[k] for k in loud[name]])
-            own = self._evidence_of(name, sound, onsets, background_lags(sound, len(loud[name])))
-            return replace(own, beginning=part.beginning)
-
-        return tuple(of_loud(part) for part in evidence)
-
     def evidence(self, sounds: Mapping[str, Sound]) -> tuple[Evidence, ...]:
         """Sum each array's onset GCCs; the evidence is in the order of the arrays' names."""
-        first = first_frame(sounds)
-        return tuple(self._onset_evidence(name, sounds[name], first) for name in sorted(sounds))
+        return self._onsets.of(sounds)
 
     def _answer(
         self, evidence: tuple[Evidence, ...], suspect: Collection[str], *, whole: bool = False, tolerance: bool = True
@@ -318,61 +305,6 @@ class Onset(MapEstimator):
             return replace(part, gcc=replace(part.gcc, values=values), noise_rms=noise_rms)
 
         return tuple(added(part) for part in evidence)
-
-    def _without_background(self, evidence: Sequence[Evidence], place: Place) -> tuple[Evidence, ...]:
-        """Subtract the background, scaled so that it has all the power at a place: nothing of the place remains."""
-        there, _ = background_power(place.evidence, place.position_m, self.c_m_s)
-        scale = np.float32(place.power / there)
-
-        def rest(part: Evidence) -> Evidence:
-            if part.background is None:
-                return part
-            return replace(part, gcc=replace(part.gcc, values=part.gcc.values - scale * part.background))
-
-        return tuple(rest(part) for part in evidence)
-
-    def _frames(self, evidence: Evidence, sound: Sound) -> FrameGCCs:
-        sampling = self._sampling(evidence.spec.name, sound.sample_rate_hz)
-        live = np.any(evidence.gcc.values, axis=1)
-        return FrameGCCs.of(evidence.spec, sampling, sound.onsets, live, sound.course)
-
-    def _onset_evidence(self, array: str, sound: Sound, first: int | None) -> Evidence:
-        """Return the evidence of an array's sound; its beginning is around a frame index."""
-        if not sound.onsets:
-            onsets = self.onset_front_end(array, sound.sample_rate_hz).push_segments(sound.segments)
-            return self._evidence_of(array, sound, onsets, None)
-        evidence = self._evidence_of(array, sound, summed(sound.onsets), background_lags(sound))
-        is_wide = has_long_windows(self.arrays[array].aperture_m / self.c_m_s)  # as long as a beginning
-        begun = None if is_wide else beginning(sound, first)
-        if begun is None:
-            return evidence
-        parts = sound.onsets[begun]
-        own = self._evidence_of(array, sound, summed(parts), background_lags(sound, len(parts)))
-        return replace(evidence, beginning=own)
-
-    def _evidence_of(self, array: str, sound: Sound, onsets: OnsetGCC, background: Float32Array | None) -> Evidence:
-        """Return the evidence of some onsets of an array's sound, with the lags of the background among them."""
-        sampling = self._sampling(array, sound.sample_rate_hz)
-        spec = self.arrays[array]
-        pairs = microphone_pairs(len(spec.microphones_m))
-        gcc = GCC(pairs, sampling.fine_lags_s, sampling.fine(onsets.lags / onsets.heights(pairs)))
-        faint = onsets.noise_power <= FAINT * onsets.weight
-        kept = sound.without_dead_channels(gcc)
-        if background is not None:
-            background = sampling.fine(background / onsets.heights(pairs)) * np.any(kept.values, axis=1)[:, None]
-        presumed = sound.detected and faint
-        return Evidence(spec, kept, noise_rms=onsets.noise_rms, is_presumed=presumed, background=background)
-
-    def _sampling(self, array: str, sample_rate_hz: float) -> LagSampling:
-        known = self._samplings.get(array)
-        if known is not None and known[0] == sample_rate_hz:
-            return known[1]
-        spec = self.arrays[array]
-        require_band(spec, sample_rate_hz)
-        sampling = LagSampling.shared(spec.band_hz, sample_rate_hz, spec.aperture_m / self.c_m_s)
-        self._samplings[array] = (sample_rate_hz, sampling)
-        self._search.prepare(array, sampling.fine_lags_s)
-        return sampling
 
 
 def _names(evidence: Sequence[Evidence]) -> frozenset[str]:
