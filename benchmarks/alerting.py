@@ -6,8 +6,8 @@
 A round is `livessl bench --live` without anything and with everything, one after the other, in an order that changes
 from round to round. With everything, each located event is stored in SQLite, alerts over a real Mosquitto, and has its
 clip cut and enhanced. The ratios are those of the two runs of a round, which the machine slows down alike. The output
-is one JSON object; the exit status is 1 if an alert or a clip failed, if the median ratio of the latency, at 50 or
-95 %, is above `--most`, or if a run dropped or shed sound, because then the two did not do the same work.
+is one JSON object. The exit status is 1 if an alert or a clip failed, or if the median ratio of the latency, at 50 or
+95 %, is above `--most`. It is also 1 if a run dropped or shed sound, because then the two did not do the same work.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Signal-to-noise ratio that an enhanced clip gains over the best single microphone.
 
 `python benchmarks/clips.py [--positions N] [--seed S] [--write docs/accuracy/clips.md]` simulates, in a room of
-8 x 10 x 4 m with two tetrahedra 5 m apart, the project's own sounds at random places, with reverberation times of 0.4
-and 1 s, in white noise (independent in each microphone) and in diffuse noise (isotropic in three dimensions), at 10 and
-0 dB. The place that is given to the beams is wrong by a random vector (`PLACE_STD_M`).
+8 x 10 x 4 m with two tetrahedra 5 m apart, the project's own sounds at random places. Reverberation times are 0.4 and
+1 s. Noise is white (independent in each microphone) or diffuse (isotropic in three dimensions), at 10 and 0 dB.
+The place that is given to the beams is wrong by a random vector (`PLACE_STD_M`).
 
 How it is measured: the weights are computed from the mixture alone. The same weights are then applied to three parts of
 the mixture: the sound with its reflections of the first 50 ms (`early`), the later reverberation (`late`), and the

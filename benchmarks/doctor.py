@@ -9,7 +9,7 @@ the report. A fault counts as named if a finding has its code, its array and, wh
 `--live` the events go one by one to the examination of a running server, which is looked at after each.
 
 The examinations of two arrays use what they observed beside the third one (clocks, too), and those of plugs in other
-inputs what is observed with the plugs where they belong: a test shows that it differs by less than the delays' errors,
+inputs what is observed with the plugs where they belong. A test shows that it differs by less than the delays' errors,
 and `--live` does localize them. Rows are appended to `rows.jsonl` as they come, and those that are there are not
 made again, so that a campaign can be interrupted. Observations are kept in `--cache`, if given: then only conclusions
 are drawn again.

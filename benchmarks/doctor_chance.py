@@ -6,9 +6,9 @@ The rooms and the set-ups are those of `doctor_rooms.py`, from seed 2000 on. Not
 sounds have standard deviations that grow with the distance as those of the rendered rooms do (0.3 us at 1.8 m, 3 us at
 7 m), and 20 us for 5 % of the sounds at each array, which received an echo.
 
-Beside what the doctor says stands how often the best test would tell the fault that looks for nothing else: it knows
-the axis of the turn, or the line of the shift, but not the array and the sense, and tells the fault in 2 % of the
-careful set-ups. It follows from the slopes of the delays. A doctor that has to tell other faults, too, names fewer.
+Beside what the doctor says stands how often the best test would name the fault that looks for nothing else. It knows
+the axis of the turn, or the line of the shift, but not the array and the sense, and names a fault in 2 % of the careful
+set-ups. It follows from the slopes of the delays. A doctor that has to tell other faults, too, names fewer.
 """
 
 from __future__ import annotations

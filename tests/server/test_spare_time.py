@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import pytest
-from world import HandClock
+from world_parts import HandClock
 
 from livessl.server import spare_time
 from livessl.server.overload import Overload

@@ -1,7 +1,7 @@
 """The guard of the nodes' socket: CURVE, and a handler of ZeroMQ's authentication protocol ZAP (RFC 27) on a thread.
 
 pyzmq's `ThreadAuthenticator` does not serve here. Its callback gets the key but not the caller's address, which the
-list of refusals needs; it does not report that its thread has failed; and handshakes that fail before a key is shown
+list of refusals needs, and it does not report that its thread has failed. Handshakes that fail before a key is shown
 would need a socket monitor, on a thread of its own, anyway.
 """
 

@@ -1,8 +1,8 @@
 """Says whether sounds at unknown places leave open that the whole room is mirrored.
 
 Arrays that are reflected in a plane, and with them all sounds, receive the same. If the centres of all arrays lie in
-the plane and the reflection of each is nearly the array itself with its channels in another order, a set-up as filed
-cannot be distinguished from one whose channels are exchanged at each array: every place is then on the wrong side of
+the plane and the reflection of each is nearly the array itself with its channels in another order, the set-up as filed
+cannot be distinguished from one whose channels are exchanged at each array. Every place is then on the wrong side of
 the plane.
 """
 

@@ -77,7 +77,7 @@ class GCCPhat:
     near-Nyquist lags and interpolated to `OVERSAMPLING` lags a sample (`LagSampling`).
 
     If the band begins above `ENVELOPE_ABOVE` times its own width, R is the magnitude of the same sum instead of its
-    real part: otherwise the periods of the carrier would be side lobes nearly as high as the peak, and an error of a
+    real part. Otherwise the periods of the carrier would be side lobes nearly as high as the peak, and an error of a
     centimetre in a microphone's position would reverse their sign.
 
     Parameters

@@ -5,8 +5,8 @@ distance to the microphone and r that to the array's centre. The beam is w^H X. 
 that comes directly from the place adds up.
 
 In a room early reflections come with the direct sound, within one window of the transform, and carry as much of it. The
-minimum-variance beam (MVDR) therefore takes the whole response h instead of d, estimated from the sound itself: L h is
-the principal eigenvector of L^-1 R_x L^-H, with R_x the covariance during the sound and R = L L^H that of the noise in
+minimum-variance beam (MVDR) therefore takes the whole response h instead of d, estimated from the sound itself. L h is
+the principal eigenvector of L^-1 R_x L^-H. R_x is the covariance during the sound, and R = L L^H that of the noise in
 the quiet before it (covariance whitening: Markovich, Gannot and Cohen, IEEE TASLP 17(6), 2009). It passes the sound as
 delay-and-sum does, w^H h = d^H h / (d^H d), so that only what comes from the place is passed, and minimizes the noise:
 w = R^-1 h (h^H d) / (h^H R^-1 h d^H d). Where the sound hardly exceeds the noise, h is drawn to d (`PRIOR`).

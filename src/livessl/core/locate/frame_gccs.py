@@ -183,9 +183,9 @@ class Remainder:
     def prominences(self, delays_s: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Prominence in each frame of a source at delays (P,), above reflections and above noise: (F,) each.
 
-        It is the mean height over the pairs, in units of what may be as high without such a source: the root mean
-        square of the frame, the noise that there was before the sound and, in the first of the two, reflections of the
-        removed source. It is 0 in the pre-roll.
+        It is the mean height over the pairs, in units of what may be as high without such a source. That is the root
+        mean square of the frame, the noise that there was before the sound and, in the first of the two, reflections of
+        the removed source. It is 0 in the pre-roll.
         """
         frames = self._frames
         heights, independent = self.heights(delays_s)

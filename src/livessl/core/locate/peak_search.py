@@ -1,7 +1,7 @@
 """The highest points of the summed power maps, exactly, without the maps: branch and bound over cells of the grid.
 
 Over a cell of the grid each pair's delay lies in an interval. The maximum of its GCC over that interval bounds what the
-pair can add at any point of the cell; the sum of these maxima bounds the cell, and a cell whose bound is below the best
+pair can add at any point of the cell, and the sum of these maxima bounds the cell. A cell whose bound is below the best
 power known can be skipped (in the spirit of Nunes et al., IEEE TSP 2014, but with a bound that proves the answer).
 Usually about 2000 points out of millions are visited. Where nothing stands out most cells are, and the search takes
 longer, but never much longer than the map. Memory is bounded whatever the grid (`livessl.core.locate.search_cubes`).

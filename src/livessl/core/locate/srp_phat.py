@@ -36,9 +36,10 @@ class SrpPhat(MapEstimator):
         Speed of sound, m/s.
     band_limit : bool or None
         Whether the band is limited per pair and grid point against spatial aliasing. None limits it for those arrays of
-        which more than half of all pairs and points of the map would lose part of the band: an array of 0.5 m on a
-        0.5 m grid, but not on a 0.1 m grid, where the answer would hardly change. If the band of any array in a sound
-        is limited, the peak is read from the map; otherwise it is searched for on the grid, which may be finer.
+        which more than half of all pairs and points of the map would lose part of the band. That is so for an array of
+        0.5 m on a 0.5 m grid, but not on a 0.1 m grid, where the answer would hardly change. If the band of any array
+        in a sound is limited, the peak is read from the map; otherwise it is searched for on the grid, which may be
+        finer.
     """
 
     name = SRP_PHAT

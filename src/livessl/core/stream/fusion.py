@@ -1,9 +1,9 @@
 """Fusion: the frames of all arrays become updates, events and tracks. It reads no clock.
 
-`Fusion.step(messages, now_ns)` is the only entry for messages, live and replayed. It composes the stages: `Alignment`
-puts the frames on one frame index and closes it, `EvidenceCollector` correlates them and collects excerpts, `Verdicts`
-locates and judges these, `UpdateSchedule` says which windows are located while a sound goes on, `EventReporter` decides
-when an event is reported, and `Tracker` follows the sources.
+`Fusion.step(messages, now_ns)` is the only entry for messages, live and replayed. It composes the stages. `Alignment`
+puts the frames on one frame index and closes it, `EvidenceCollector` correlates them and collects excerpts, and
+`Verdicts` locates and judges these. `UpdateSchedule` says which windows are located while a sound goes on,
+`EventReporter` decides when an event is reported, and `Tracker` follows the sources.
 """
 
 from __future__ import annotations

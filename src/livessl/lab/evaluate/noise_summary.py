@@ -31,8 +31,8 @@ STANDARD, OURS = METHODS
 def summary(columns: Columns) -> list[SummaryRow]:
     """Summarize each kind and level of noise by each method, over all rooms and sounds; then each of `PARTS`.
 
-    `right` is the share of all sounds that are located within `NEAR_M`; `wrong` is the share of the located ones that
-    are further off, and `at_noise` the share of those within `NEAR_M` of a noise source; `withheld` is the share of all
+    `right` is the share of all sounds that are located within `NEAR_M`. `wrong` is the share of the located ones that
+    are further off, and `at_noise` the share of those within `NEAR_M` of a noise source. `withheld` is the share of all
     sounds whose best place is within `NEAR_M` but not reported as a position. Each room has a row at each level, too.
     Intervals are 95 % intervals by Wilson, as if sounds were independent. The sounds of `OTHER_SOUNDS` have rows of
     their own alone.
