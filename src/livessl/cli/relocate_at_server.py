@@ -174,7 +174,7 @@ class ServerArchive:
 
 
 def _patiently(ask: Callable[[], T]) -> T:
-    """Return an answer; ask again for up to `BUSY_S` while the server is busy, and say so once.
+    """Return an answer; ask again for up to `BUSY_S` while the server is busy, with one message.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Where messages go: all to the subscribers, and some to the hub, the journal and the alerts as well."""
+"""Hands messages on: all to the subscribers, and some to the hub, the journal and the alerts as well."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from livessl.site.models import Site
 
 @dataclass(frozen=True, slots=True)
 class SharedState:
-    """What a server knows of itself.
+    """The state of a server that most of its parts are given.
 
     Parameters
     ----------

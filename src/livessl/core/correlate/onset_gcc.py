@@ -3,12 +3,12 @@
 Reverberation follows from the past. In each bin of the short-time spectrum the power P is compared with what the past
 explains, I = max(r N, max_s lambda^s P(t - s)): the stationary noise N, and all earlier power, decaying. The excess
 S = max(P - I, 0) is taken to come straight from a source. The expected coherence between two microphones is then
-gamma = S / (S + I), and their phases have the weight
+gamma = S / (S + I). Their phases have the weight of maximum likelihood (Knapp and Carter 1976, after Hannan and
+Thomson):
 
-    w = gamma^2 / (1 - gamma^2) = S^2 / (I (I + 2 S)),
+    w = gamma^2 / (1 - gamma^2) = S^2 / (I (I + 2 S)).
 
-the maximum-likelihood weight (Knapp and Carter 1976, after Hannan and Thomson). The usual estimate of gamma, from long
-averages, fails in reverberation; this one follows the precedence effect.
+The usual estimate of gamma, from long averages, fails in reverberation; this one follows the precedence effect.
 
 The GCC is sum_t w conj(U_i) U_k, U = X/sqrt(P), summed over the band and *not* normalised: windows and bins with more
 evidence count more, and sums over frames give the GCC of a window or an event. `onset_weights` and `cross_spectra` of

@@ -1,15 +1,16 @@
 """Which arrays contribute to a position, and which show no more than their own noise would. It sees correlations only.
 
 If the phases between the microphones are random, each pair's GCC is noise of a known standard deviation, and an array's
-SRP is a smooth random field over the directions. The highest point of such a field exceeds u standard deviations with a
-probability of about
+SRP is a smooth random field over the directions. The probability that the highest point of such a field exceeds u
+standard deviations is about the expected Euler characteristic (Adler and Taylor, Random Fields and Geometry, 2007,
+chapter 12).
 
-    p(u) = (1 + l / (2 pi) + a u / (2 pi)^(3/2)) exp(-u^2 / 2),
+    p(u) = (1 + l / (2 pi) + a u / (2 pi)^(3/2)) exp(-u^2 / 2)
 
-where l and a are the length and the area of the directions in units of the field's correlation length: the expected
-Euler characteristic (Adler and Taylor, Random Fields and Geometry, 2007, chapter 12). An array stands out if its own
-highest place exceeds what noise reaches in a share `FALSE_ALARMS` of all sounds. If another array stands out, the
-common place lies on that array's line of sight, and an array has to exceed only what noise reaches along a line, a = 0.
+Here l and a are the length and the area of the directions in units of the field's correlation length. An array stands
+out if its own highest place exceeds what noise reaches in a share `FALSE_ALARMS` of all sounds. If another array stands
+out, the common place lies on that array's line of sight, and an array has to exceed only what noise reaches along a
+line, a = 0.
 An array that shows less would move the position to where its noise happens to fit, and would seem to confirm it.
 
 Where at least two other arrays determine the common place, and are together far above what noise reaches anywhere, an

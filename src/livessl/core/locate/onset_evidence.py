@@ -1,4 +1,4 @@
-"""What a sound is located from by its onsets: the GCCs of each array, with the lags of its background."""
+"""The evidence of a sound by its onsets: the GCCs of each array, with the lags of its background."""
 
 from __future__ import annotations
 

@@ -1,5 +1,7 @@
 """The life of an event, from its first active frame until it has been reported. It locates nothing.
 
+Its states are these.
+
 | state | entered when | next state |
 |---|---|---|
 | `OPEN` | a frame index with an active frame closes | `ENDED`; `REPORTED` if it is cut short |
