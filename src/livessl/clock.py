@@ -48,6 +48,11 @@ class SystemClock:
         return _sleep((time_ns - time.time_ns()) / 1e9)
 
 
+def thread_time_s() -> float:
+    """Return the processor time, in seconds, that the calling thread has taken."""
+    return time.thread_time()
+
+
 class PacedClock:
     """Site time that runs from `start_ns` on at `speed` times the machine's pace: the clock of a replay."""
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import logging
 import threading
-import time
 from collections.abc import Callable
 from typing import Final
 
+from livessl.clock import thread_time_s
 from livessl.server.overload import Overload
 
 JOIN_S: Final = 1.0
@@ -80,10 +80,10 @@ class SpareTimeThread:
                 rest_s = self._wait_s
                 if self._overload.message is not None:
                     continue
-                began_s = time.thread_time()
+                began_s = thread_time_s()
                 self._work()
                 if not self._is_urgent():
-                    rest_s = max(rest_s, (time.thread_time() - began_s) * (1.0 / self._share - 1.0))
+                    rest_s = max(rest_s, (thread_time_s() - began_s) * (1.0 / self._share - 1.0))
         except BaseException as error:
             self.failure = error
             _log.exception("%s has failed; the server ends", self._what)
