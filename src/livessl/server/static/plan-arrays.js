@@ -35,16 +35,20 @@ export function drawArrays(plan, arrays) {
   }
 }
 
-/** The names of healthy arrays, some in a line, and each other one with its state in a line of its own. */
+/** The names of the arrays in each state, some in a line; the last line of each state but "healthy" says it. */
 function labelLines(arrays, colours) {
-  const healthy = arrays.filter(({ state }) => state === "healthy").map(({ name }) => name);
-  const lines = [];
-  for (let from = 0; from < healthy.length; from += NAMES_A_LINE) {
-    const more = from + NAMES_A_LINE < healthy.length ? "," : "";
-    lines.push({ text: healthy.slice(from, from + NAMES_A_LINE).join(", ") + more, colour: colours.text });
-  }
-  const others = arrays.filter(({ state }) => state !== "healthy");
-  return [...lines, ...others.map(({ name, state }) => ({ text: `${name} · ${state}`, colour: colours.states[state] ?? colours.muted }))];
+  return [...new Set(arrays.map(({ state }) => state))].flatMap((state) => {
+    const names = arrays.filter((array) => array.state === state).map(({ name }) => name);
+    const healthy = state === "healthy";
+    const colour = healthy ? colours.text : colours.states[state] ?? colours.muted;
+    const rows = Array.from({ length: Math.ceil(names.length / NAMES_A_LINE) }, (_, row) => (
+      names.slice(row * NAMES_A_LINE, (row + 1) * NAMES_A_LINE).join(", ")
+    ));
+    return rows.map((text, row) => {
+      const end = row < rows.length - 1 ? "," : healthy ? "" : ` · ${state}`;
+      return { text: text + end, colour };
+    });
+  });
 }
 
 /** Draw an array, and return the radius of its outline in pixels. */

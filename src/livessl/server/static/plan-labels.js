@@ -68,8 +68,9 @@ export class Labels {
 
   /** Write all labels that have found a place. */
   draw() {
-    const { canvas } = this.plan;
-    const bounds = { left: EDGE, top: EDGE, width: canvas.clientWidth - 2 * EDGE, height: canvas.clientHeight - 2 * EDGE };
+    const { canvas: { clientWidth, clientHeight }, flat, covered } = this.plan;
+    const width = clientWidth - 2 * EDGE - (flat ? 0 : covered);
+    const bounds = { left: EDGE, top: EDGE, width, height: clientHeight - 2 * EDGE };
     const wanted = this.wanted.sort((a, b) => a.order - b.order);
     const boxes = placed(wanted, bounds, this);
     boxes.forEach((box, index) => {

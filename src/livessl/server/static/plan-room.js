@@ -96,7 +96,7 @@ export function drawAxes(plan) {
     const x = sharp(left + a * scale);
     g.moveTo(x, bottom + 1);
     g.lineTo(x, bottom + 6);
-    label(number(a, digits), x, bottom + 15, "center");
+    label(number(a, digits), x, bottom + 16, "center");
   }
   for (let b = 0; b <= size[k] + 1e-6; b += step) {
     const y = sharp(bottom - b * scale);

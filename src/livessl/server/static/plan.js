@@ -27,6 +27,8 @@ export class Plan {
     this.size = null;
     /** Where the 3-D view is looked at from, or null before it was shown: see camera.js. */
     this.camera = null;
+    /** Pixels at the right of the 3-D view that its buttons cover. */
+    this.covered = 0;
     this.look(view);
     plans.set(canvas, this);
     canvas.addEventListener("pointermove", ({ offsetX, offsetY }) => {
@@ -54,6 +56,8 @@ export class Plan {
     else this.aim(this.camera);
     this.axes = this.flat ? this.projection.axes : null;
     this.axisNames = this.axes?.map((axis) => AXIS_NAMES[axis]);
+    /** The labels of the last drawing of this view, or null before it. */
+    this.labels = null;
   }
 
   /** Look at the 3-D view by another camera, or none as long as the room is not known, at the next drawing. */
@@ -63,7 +67,7 @@ export class Plan {
   }
 
   get margin() {
-    return this.flat ? MARGIN : MARGIN_3D;
+    return this.flat ? MARGIN : { ...MARGIN_3D, right: MARGIN_3D.right + this.covered };
   }
 
   /** Pixels per metre at which the whole room fits. */

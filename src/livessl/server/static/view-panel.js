@@ -7,6 +7,9 @@ import { Plan } from "./plan.js";
 const STORAGE_KEY = "livessl-view";
 /** Width over height of the 3-D view's frame, where the page is narrow. */
 const ASPECT_3D = 1.25;
+/** Where the page is wide, the buttons of the 3-D view stand on it and cover this many pixels: see plan-views.css. */
+const WIDE = matchMedia("(min-width: 1201px)");
+const COVERED = 92;
 const KEYS_3D = "Arrow keys turn it, with Shift they move it, plus and minus zoom, Home resets it";
 /** The views: title, text for screen readers, power maps that they show, and width over height of a room. */
 const VIEWS = {
@@ -50,6 +53,7 @@ export class ViewPanel {
       button.addEventListener("click", () => this.turning.step(button.dataset.step));
     }
     addEventListener("hashchange", () => this.#follow());
+    WIDE.addEventListener("change", () => this.#fitFrame());
   }
 
   /** Show the view that the page's address names, `#view=3d`, or else the one that was chosen last. */
@@ -115,6 +119,7 @@ export class ViewPanel {
   }
 
   #fitFrame() {
+    this.plan.covered = WIDE.matches ? COVERED : 0;
     if (this.size === null) return;
     this.frame.style.setProperty("--aspect", String(VIEWS[this.plan.view].aspect(this.size)));
   }
@@ -122,7 +127,7 @@ export class ViewPanel {
   /** Write where the room is looked at from. */
   #say() {
     const { azimuthDeg, elevationDeg, zoom } = this.plan.camera;
-    write(this.pointer, `from ${number(azimuthDeg, 0)}°, ${number(elevationDeg, 0)}° up, × ${number(zoom, 1)}`);
+    write(this.pointer, `azimuth ${number(azimuthDeg, 0)}°  elevation ${number(elevationDeg, 0)}°  zoom ${number(zoom, 1)}`);
   }
 }
 
