@@ -49,7 +49,7 @@ COLOUR: Final = """
 
 @contextmanager
 def room_server() -> Iterator[Server]:
-    """A server that has replayed the small scene; a third array, a silent one, differs from the first one in x alone."""
+    """A server that has replayed the small scene; a third array, which is silent, differs from the first in x alone."""
     east = {**NORTH, "position_m": [3.2, *NORTH["position_m"][1:]]}
     changes = {
         "arrays": {**SMALL["arrays"], "east": east},

@@ -91,7 +91,7 @@ export class ViewPanel {
     try {
       const [solid, { Turning }] = await Promise.all([import("./plan-solid.js"), import("./plan-turn.js")]);
       this.turning ??= new Turning(this.plan, () => {
-        this.#say();
+        if (!this.plan.flat) this.#say(); // a step may end after another view was chosen
         this.onTurn();
       });
       if (this.chosen === view) this.#put(view, solid);
