@@ -107,7 +107,7 @@ def directions(azimuth_deg: float, elevation_deg: float) -> FloatArray:
 
 
 def overlap(a: dict[str, Any], b: dict[str, Any]) -> bool:
-    """Whether two boxes, each with left, top, width and height, share a part."""
+    """Return whether two boxes, each with left, top, width and height, overlap."""
     return bool(
         a["left"] < b["left"] + b["width"]
         and b["left"] < a["left"] + a["width"]
@@ -117,6 +117,6 @@ def overlap(a: dict[str, Any], b: dict[str, Any]) -> bool:
 
 
 def leaves(box: dict[str, Any], width: float, height: float) -> bool:
-    """Whether a part of a box is outside a canvas of this size."""
+    """Return whether a part of a box is outside a canvas of this size."""
     across = box["left"] < 0 or box["left"] + box["width"] > width
     return bool(across or box["top"] < 0 or box["top"] + box["height"] > height)

@@ -134,7 +134,7 @@ def test_camera_takes_the_shorter_way_round(script: Script) -> None:
 
 @pytest.mark.parametrize("count", [3, 30, 200])
 def test_labels_never_overlap_and_never_leave_their_bounds(script: Script, count: int) -> None:
-    """With 200 there is no room for all: some get no place, and the others still keep to the rule."""
+    """There is no room for 200 labels: some get no place, and the others still do not overlap."""
     rng = np.random.default_rng(count)
     labels = [
         {"anchor": rng.uniform(0, [600, 300]).tolist(), "gap": 12, "width": float(width), "height": 15}

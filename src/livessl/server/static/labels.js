@@ -11,9 +11,9 @@ const CLEAR = 2;
  * Find a place for each label: { left, top, width, height, away }, or null where there is none.
  *
  * Labels are { width, height } with either `spots`, the only places [left, top] for it, or `anchor`, the point [x, y]
- * that it names, and `gap`, the radius in pixels of what is drawn there. One that is `far` is never beside its anchor. The
- * first labels choose first. None leaves `bounds`, or the box `within` of its own, or covers a `taken` box; they cover boxes to `avoid`, where other things
- * are drawn, only if there is no other place. Boxes are { left, top, width, height }.
+ * that it names, and `gap`, the radius in pixels of what is drawn there. One that is `far` is never beside its anchor.
+ * The first labels choose first. None leaves `bounds`, or its own box `within`, and none covers a `taken` box. They cover
+ * boxes to `avoid`, where other things are drawn, only if there is no other place. Boxes are { left, top, width, height }.
  */
 export function placed(labels, bounds, { taken = [], avoid = [] } = {}) {
   const used = [...taken];
@@ -42,7 +42,8 @@ export function together(points, reach) {
 
 function firstFree(label, bounds, used, avoid) {
   const places = label.spots ? label.spots.map(([left, top]) => boxAt(label, left, top, false)) : around(label);
-  const free = places.filter((box) => inside(box, label.within ?? bounds) && !used.some((other) => overlap(box, other, CLEAR)));
+  const within = label.within ?? bounds;
+  const free = places.filter((box) => inside(box, within) && !used.some((other) => overlap(box, other, CLEAR)));
   return free.find((box) => !avoid.some((other) => overlap(box, other))) ?? free[0] ?? null;
 }
 
