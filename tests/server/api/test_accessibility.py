@@ -230,6 +230,19 @@ def test_live_page_of_each_role(browser: Browser, desk: Desk, role: str) -> None
         assert violations(page, f"live page of the {role}") == []
 
 
+@pytest.mark.parametrize("view", ["front", "3d"])
+def test_other_views_of_the_room(browser: Browser, desk: Desk, view: str) -> None:
+    with faultless_page(browser) as page:
+        opened(page, f"{desk.server.url}/#view={view}", desk.tokens["viewer"])
+        expect(page.locator("#side-panel")).to_have_attribute("data-view", view, timeout=MS)
+        expect(page.get_by_test_id("array-east")).to_have_attribute("data-state", "lost", timeout=MS)
+        if view == "3d":
+            page.locator("#side").focus()
+            page.keyboard.press("ArrowRight")
+            expect(page.locator("#side-pointer")).to_contain_text("azimuth")
+        assert violations(page, f"view {view}") == []
+
+
 def answer_with(page: Page, path: str, **answer: Any) -> None:
     """Have requests of a page answered without the server."""
     page.route(f"**/api/v1/{path}", lambda route: route.fulfill(json={"v": 1, **answer}))

@@ -17,6 +17,7 @@ import { ZoneEditor } from "./plan-zones-editor.js";
 import { Relocate } from "./relocate.js";
 import { SetUp } from "./set-up.js";
 import { readColours } from "./plan-style.js";
+import { ViewPanel } from "./view-panel.js";
 
 const API = new URL("api/v1/", document.baseURI);
 /** Events that are loaded from the store when the page connects. */
@@ -39,10 +40,19 @@ const TICK_MS = 100;
 const model = new Model();
 const header = new Header();
 const readout = new Readout();
-const plans = [
-  new Plan(find("floor"), "floor", find("floor-pointer")),
-  new Plan(find("side"), "side", find("side-pointer")),
-];
+const viewPanel = new ViewPanel({
+  onView(maps) {
+    mapPanel.need(["floor", ...maps]);
+    redraw();
+  },
+  onTurn() {
+    turnFrame ??= requestAnimationFrame(() => {
+      turnFrame = null;
+      if (model.site !== null) drawTogether([viewPanel.plan], model.site.room.size_m, scene(Date.now()), colours);
+    });
+  },
+});
+const plans = [new Plan(find("floor"), "floor", find("floor-pointer")), viewPanel.plan];
 const arraysPanel = new ArraysPanel(find("arrays"), find("arrays-empty"), (name, enabled) => {
   const address = new URL(`arrays/${encodeURIComponent(name)}/enabled`, API);
   put(address, { enabled }).catch((error) => console.warn(`livessl: array ${name}:`, error.message));
@@ -82,6 +92,8 @@ let announcedAt = -Infinity;
 let linkedHash = "";
 let dirty = true;
 let frameRequested = false;
+/** The request of a frame in which the 3-D view alone is drawn because it has turned, or null. */
+let turnFrame = null;
 
 // --- messages -------------------------------------------------------------------------------------------------
 
@@ -210,9 +222,9 @@ function loadSite() {
     header.showPrivacy(site.privacy);
     zoneEditor.show(site.zones, site.can_draw);
     if (site.floor_plan !== null) loadFloorPlan(site.floor_plan);
-    const [x, y, z] = site.room.size_m;
+    const [x, y] = site.room.size_m;
     find("floor-frame").style.setProperty("--aspect", String(x / y));
-    find("side-frame").style.setProperty("--aspect", String(y / z));
+    viewPanel.showRoom(site.room.size_m);
     find("floor-empty").hidden = true;
   });
 }
@@ -337,8 +349,12 @@ function redraw() {
 function draw(now) {
   if (model.site === null) return;
   dirty = false;
-  drawTogether(plans, model.site.room.size_m, model.scene(now, mapPanel.images, zoneEditor.draft), colours);
+  drawTogether(plans, model.site.room.size_m, scene(now), colours);
   setUp.place();
+}
+
+function scene(now) {
+  return model.scene(now, mapPanel.images, zoneEditor.draft);
 }
 
 function applyTheme() {
@@ -351,6 +367,7 @@ function applyTheme() {
 
 const setUp = new SetUp({ load: getJson, send: postJson, plan: plans[0], redraw });
 applyTheme();
+viewPanel.start();
 light.addEventListener("change", applyTheme);
 const sizes = new ResizeObserver(redraw);
 for (const plan of plans) sizes.observe(plan.canvas);

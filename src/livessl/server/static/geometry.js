@@ -1,7 +1,10 @@
 // Shapes of uncertainty and direction, computed from numbers alone.
 
-/** 95 % quantile of the chi-square distribution with two degrees of freedom: -2 ln 0.05. */
+/** 95 % quantiles of the chi-square distribution with two degrees of freedom, -2 ln 0.05, and with three. */
 const CHI2_95 = 5.991;
+const CHI2_95_OF_3 = 7.815;
+/** Sweeps of Jacobi's method for a 3 x 3 matrix: it converges quadratically. */
+const SWEEPS = 8;
 
 /** The eigenvalues, larger first, of [[a, b], [b, d]], and the angle of the larger one's axis in radians. */
 function eigen2(a, b, d) {
@@ -10,12 +13,40 @@ function eigen2(a, b, d) {
   return { major: mean + spread, minor: mean - spread, angle: 0.5 * Math.atan2(2 * b, a - d) };
 }
 
-/** Half axes in metres and angle of the 95 % ellipse in the plane of two axes, or null without a covariance. */
-export function ellipse95(covariance, [i, k]) {
-  if (!covariance) return null;
-  const { major, minor, angle } = eigen2(covariance[i][i], covariance[i][k], covariance[k][k]);
+/** Half axes in metres and angle of the ellipse at which a 2 x 2 quadratic form, in m², is `square`; or null. */
+export function ellipse([[a, b], [, d]], square) {
+  const { major, minor, angle } = eigen2(a, b, d);
   if (!Number.isFinite(major) || major <= 0) return null;
-  return { a: Math.sqrt(CHI2_95 * major), b: Math.sqrt(CHI2_95 * Math.max(minor, 0)), angle };
+  return { a: Math.sqrt(square * major), b: Math.sqrt(square * Math.max(minor, 0)), angle };
+}
+
+/** The ellipse that holds 95 % of a 2 x 2 covariance: see `ellipse`. */
+export const ellipse95 = (covariance) => ellipse(covariance, CHI2_95);
+
+/** The three half axes, vectors in metres, of the ellipsoid that holds 95 % of a 3 x 3 covariance; or null. */
+export function ellipsoid95(covariance, longest) {
+  if (!covariance?.flat().every(Number.isFinite)) return null;
+  const { values, vectors } = eigen3(covariance);
+  return values.map((value, index) => {
+    const length = Math.min(longest, Math.sqrt(CHI2_95_OF_3 * Math.max(value, 0)));
+    return vectors.map((row) => row[index] * length);
+  });
+}
+
+/** The eigenvalues of a symmetric 3 x 3 matrix, and their unit vectors as columns, by Jacobi's method. */
+export function eigen3(matrix) {
+  const a = matrix.map((row) => [...row]);
+  const vectors = [[1, 0, 0], [0, 1, 0], [0, 0, 1]];
+  for (let sweep = 0; sweep < SWEEPS; sweep += 1) {
+    for (const [i, k] of [[0, 1], [0, 2], [1, 2]]) {
+      if (a[i][k] === 0) continue;
+      const turn = 0.5 * Math.atan2(2 * a[i][k], a[i][i] - a[k][k]);
+      const [cos, sin] = [Math.cos(turn), Math.sin(turn)];
+      for (const row of [...a, ...vectors]) [row[i], row[k]] = [cos * row[i] + sin * row[k], cos * row[k] - sin * row[i]];
+      [a[i], a[k]] = [a[i].map((c, n) => cos * c + sin * a[k][n]), a[k].map((c, n) => cos * c - sin * a[i][n])];
+    }
+  }
+  return { values: [0, 1, 2].map((i) => a[i][i]), vectors };
 }
 
 /** Standard deviation in metres along the longest axis of a 3 x 3 covariance, by power iteration; null without one. */

@@ -28,16 +28,18 @@ function unpack(bytes) {
   };
 }
 
-/** Receives the floor's and the side's map of one array, or of all arrays fused. */
+/** Receives the maps of some views, of one array or of all arrays fused. */
 export class MapFeed {
-  /** `onMaps({ floor, side, bornMs, time })` gets the two views of one window. */
+  /** `onMaps({ views, bornMs, time })` gets the maps of one window, by view. */
   constructor(base, onMaps) {
     this.url = new URL("map", base);
     this.url.protocol = this.url.protocol === "https:" ? "wss:" : "ws:";
     this.onMaps = onMaps;
     this.choice = "fused";
     this.socket = null;
-    this.floor = null;
+    this.views = ["floor", "side"];
+    /** The maps of the newest window so far, by view. */
+    this.window = { timeNs: null, views: {} };
     this.retry = null;
     document.addEventListener("visibilitychange", () => this.watch());
   }
@@ -45,6 +47,15 @@ export class MapFeed {
   /** Receive other maps: "fused" or an array's name. */
   choose(name) {
     this.choice = name;
+    this.#close();
+    this.watch();
+  }
+
+  /** Receive the maps of other views. */
+  need(views) {
+    if (views.join() === this.views.join()) return;
+    this.views = views;
+    if (this.socket === null) return;
     this.#close();
     this.watch();
   }
@@ -63,7 +74,7 @@ export class MapFeed {
   }
 
   #open() {
-    this.url.search = new URLSearchParams({ array: this.choice, views: "floor,side" });
+    this.url.search = new URLSearchParams({ array: this.choice, views: this.views.join() });
     const socket = new WebSocket(this.url, protocols());
     socket.binaryType = "arraybuffer";
     this.socket = socket;
@@ -77,12 +88,13 @@ export class MapFeed {
     };
   }
 
-  /** Keep the floor's map until the side's map of the same window arrives. */
+  /** Keep a map until those of all views of the same window have arrived. */
   #take(map) {
-    if (map.view === "floor") this.floor = map;
-    else if (this.floor !== null && this.floor.timeNs === map.timeNs) {
-      const time = new Date(Number(map.timeNs / 1000000n)).toISOString();
-      this.onMaps({ floor: this.floor, side: map, bornMs: map.bornMs, time });
-    }
+    if (map.timeNs !== this.window.timeNs) this.window = { timeNs: map.timeNs, views: {} };
+    const { views } = this.window;
+    views[map.view] = map;
+    if (!this.views.every((view) => view in views)) return;
+    const time = new Date(Number(map.timeNs / 1000000n)).toISOString();
+    this.onMaps({ views: { ...views }, bornMs: map.bornMs, time });
   }
 }

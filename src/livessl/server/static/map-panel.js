@@ -16,7 +16,7 @@ export class MapPanel {
     this.onChange = onChange;
     this.scale = null;
     this.maps = null;
-    /** { floor, side, bornMs }, each view as { canvas, bounds }; or null without a map. */
+    /** Each view as { canvas, bounds }, and bornMs; or null without a map. */
     this.images = null;
     this.select = find("map-choice");
     this.label = find("map-age");
@@ -26,6 +26,11 @@ export class MapPanel {
 
   watch() {
     this.feed.watch();
+  }
+
+  /** Receive the maps of these views, "floor", "side" and "front". */
+  need(views) {
+    this.feed.need(views);
   }
 
   clear() {
@@ -70,9 +75,9 @@ export class MapPanel {
   }
 
   #show(maps) {
-    const painted = (map) => ({ canvas: paintMap(map, this.scale), bounds: map.bounds });
+    const painted = ([view, map]) => [view, { canvas: paintMap(map, this.scale), bounds: map.bounds }];
     this.maps = maps;
-    this.images = maps && { floor: painted(maps.floor), side: painted(maps.side), bornMs: maps.bornMs };
+    this.images = maps && { ...Object.fromEntries(Object.entries(maps.views).map(painted)), bornMs: maps.bornMs };
     this.onChange();
   }
 }

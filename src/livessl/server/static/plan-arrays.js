@@ -1,36 +1,95 @@
-// The layer of a plan that shows an array: its microphones, its name, its state, and whether it receives sound.
+// The layer of a plan that shows the arrays: microphones, names, states, and which ones receive sound.
 
-import { LABEL } from "./plan-style.js";
+import { together } from "./labels.js";
+import { ORDER } from "./plan-labels.js";
+import { SMALL } from "./plan-style.js";
 
 /** Least radius of an array's outline, and its distance from the outermost microphone, in pixels. */
 const LEAST_RADIUS = 11;
 const OUTLINE_GAP = 6;
 
-export function drawArray(plan, { name, position, microphones, state, active }) {
+/** Arrays nearer to each other than this, in pixels, share one label: they cannot be told apart. */
+const JOIN = 9;
+/** Most names in a line of a shared label. */
+const NAMES_A_LINE = 3;
+/** Reach of an array, in pixels, from which on its microphones are joined by lines, and numbered. */
+const FRAME_REACH = 26;
+const NUMBER_REACH = 44;
+
+/** Draw the arrays, the farthest first, and name them: those that coincide in this view by one label with all names. */
+export function drawArrays(plan, arrays) {
+  const { projection } = plan;
+  const drawn = [...arrays].sort((a, b) => projection.depth(a.position) - projection.depth(b.position));
+  const radii = new Map(drawn.map((array) => [array.name, drawArray(plan, array)]));
+  const points = arrays.map(({ position }) => plan.at(position));
+  arrays.forEach(({ name }, index) => plan.labels.keepOff(points[index], radii.get(name)));
+  for (const set of together(points, JOIN)) {
+    const members = set.map((index) => arrays[index]);
+    plan.labels.add({
+      order: ORDER.array,
+      lines: labelLines(members, plan.colours),
+      anchor: points[set[0]],
+      gap: Math.max(...members.map(({ name }) => radii.get(name))) + 4,
+      far: set.length > 1,
+    });
+  }
+}
+
+/** The names of the arrays in each state, some in a line; the last line of each state but "healthy" says it. */
+function labelLines(arrays, colours) {
+  return [...new Set(arrays.map(({ state }) => state))].flatMap((state) => {
+    const names = arrays.filter((array) => array.state === state).map(({ name }) => name);
+    const healthy = state === "healthy";
+    const colour = healthy ? colours.text : colours.states[state] ?? colours.muted;
+    const rows = Array.from({ length: Math.ceil(names.length / NAMES_A_LINE) }, (_, row) => (
+      names.slice(row * NAMES_A_LINE, (row + 1) * NAMES_A_LINE).join(", ")
+    ));
+    return rows.map((text, row) => {
+      const end = row < rows.length - 1 ? "," : healthy ? "" : ` · ${state}`;
+      return { text: text + end, colour };
+    });
+  });
+}
+
+/** Draw an array, and return the radius of its outline in pixels. */
+function drawArray(plan, { position, microphones, state, active }) {
   const { g, colours } = plan;
   const colour = colours.states[state] ?? colours.muted;
   const [x, y] = plan.at(position);
-  const reach = Math.max(0, ...microphones.map((microphone) => {
-    const [u, v] = plan.at(microphone);
-    return Math.hypot(u - x, v - y);
-  }));
+  const points = microphones.map((microphone) => plan.at(microphone));
+  const reach = Math.max(0, ...points.map(([u, v]) => Math.hypot(u - x, v - y)));
   const radius = Math.max(LEAST_RADIUS, reach + OUTLINE_GAP);
+  plan.solid?.drawStem(plan, position, colour, 0.5);
   if (active) drawGlow(g, x, y, radius, colour);
   drawOutline(plan, x, y, radius, colour, state, active);
-  g.fillStyle = state === "lost" ? colours.muted : colour;
-  for (const microphone of microphones) {
+  const ink = state === "lost" ? colours.muted : colour;
+  if (!plan.flat && reach > FRAME_REACH) drawFrame(plan, microphones, ink);
+  g.fillStyle = ink;
+  points.forEach(([u, v], index) => {
     g.beginPath();
-    g.arc(...plan.at(microphone), 2.1, 0, 2 * Math.PI);
+    g.arc(u, v, 2.1, 0, 2 * Math.PI);
     g.fill();
-  }
-  const healthy = state === "healthy";
-  const label = healthy ? name : `${name} · ${state}`;
-  g.font = LABEL;
-  g.textAlign = "center";
-  g.textBaseline = "top";
-  const half = g.measureText(label).width / 2 + 4;
-  const middle = Math.min(Math.max(x, plan.left + half), plan.right - half);
-  plan.text(label, middle, y + radius + 5, healthy ? colours.text : colour);
+    if (!plan.flat && reach > NUMBER_REACH) {
+      const lines = [{ text: String(index + 1), colour: ink }];
+      plan.labels.add({ order: ORDER.microphone, font: SMALL, lines, anchor: [u, v], gap: 4 });
+    }
+  });
+  return radius;
+}
+
+/** Lines between the microphones of an array, which show its shape. */
+function drawFrame(plan, microphones, colour) {
+  const { g } = plan;
+  g.globalAlpha = 0.35;
+  g.strokeStyle = colour;
+  g.lineWidth = 1;
+  microphones.forEach((from, index) => {
+    for (const to of microphones.slice(index + 1)) {
+      plan.trace([from, to]);
+      g.stroke();
+    }
+  });
+  g.globalAlpha = 1;
 }
 
 function drawGlow(g, x, y, radius, colour) {

@@ -1,9 +1,9 @@
 // Layers of a plan that show results: estimates with their uncertainty, directions, tracks and past estimates.
 
 import { number } from "./format.js";
-import { direction, ellipse95, rayEnd } from "./geometry.js";
+import { direction, ellipse, ellipse95, ellipsoid95, rayEnd } from "./geometry.js";
 import { OLD_MS } from "./model.js";
-import { LABEL } from "./plan-style.js";
+import { ORDER } from "./plan-labels.js";
 
 /** Age, in milliseconds, at which an estimate begins to fade. */
 const FRESH_MS = 1200;
@@ -29,8 +29,9 @@ function drawMarker(plan, estimate, colour, old) {
   const { g } = plan;
   const { position, covariance, kind, label, labelBelow } = estimate;
   const [x, y] = plan.at(position);
-  drawEllipse(plan, x, y, ellipse95(covariance, plan.axes), colour, old);
-  if (estimate === plan.called) drawCallout(plan, position, x, y, colour);
+  if (plan.flat) drawEllipse(plan, x, y, covariance && ellipse95(plan.projection.shadow(covariance)), colour, old);
+  else drawEllipsoid(plan, position, covariance, colour, old);
+  if (estimate === plan.called) (plan.solid?.drawCallout ?? drawCallout)(plan, position, colour);
   g.beginPath();
   g.arc(x, y, 7.5, 0, 2 * Math.PI);
   plan.halo(6);
@@ -44,21 +45,33 @@ function drawMarker(plan, estimate, colour, old) {
     g.fill();
   }
   if (!label) return;
-  g.font = LABEL;
-  g.textAlign = "left";
-  g.textBaseline = "bottom";
-  const { width } = g.measureText(label);
-  plan.text(label, x + 14 + width > plan.right ? x - 14 - width : x + 14, labelBelow ? y + 24 : y - 8, colour);
+  const heights = labelBelow ? [y + 17, y - 16] : [y - 16, y + 17];
+  const spots = heights.flatMap((middle) => [
+    { x: x + 14, y: middle, align: "left" }, { x: x - 14, y: middle, align: "right" }, { x, y: middle, align: "center" },
+  ]);
+  plan.labels.add({ order: ORDER.estimate, lines: [{ text: label, colour }], spots });
 }
 
-function drawEllipse(plan, x, y, ellipse, colour, old) {
-  if (!ellipse) return;
+/** An ellipsoid with its sections, its shadow on the floor, and a line down to it. */
+function drawEllipsoid(plan, position, covariance, colour, old) {
+  const axes = ellipsoid95(covariance, Math.hypot(...plan.size));
+  if (axes && !old) plan.solid.fillFloorShadow(plan, position, axes, colour);
+  plan.solid.drawStem(plan, position, colour, 0.7, old ? [3, 4] : []);
+  if (!axes) return;
+  const [x, y] = plan.at(position);
+  const spread = [0, 1, 2].map((i) => [0, 1, 2].map((k) => axes.reduce((sum, axis) => sum + axis[i] * axis[k], 0)));
+  drawEllipse(plan, x, y, ellipse(plan.projection.shadow(spread), 1), colour, old);
+  if (!old) plan.solid.strokeSections(plan, position, axes, colour);
+}
+
+function drawEllipse(plan, x, y, shape, colour, old) {
+  if (!shape) return;
   const { g } = plan;
   const longest = Math.hypot(...plan.size);
-  const [a, b] = [ellipse.a, ellipse.b].map((metres) => Math.min(metres, longest) * plan.scale);
+  const [a, b] = [shape.a, shape.b].map((metres) => Math.min(metres, longest) * plan.scale);
   plan.clip(() => {
     g.beginPath();
-    g.ellipse(x, y, a, b, -ellipse.angle, 0, 2 * Math.PI);
+    g.ellipse(x, y, a, b, -shape.angle, 0, 2 * Math.PI);
     if (!old) {
       const before = g.globalAlpha;
       g.globalAlpha = before * 0.14;
@@ -76,9 +89,10 @@ function drawEllipse(plan, x, y, ellipse, colour, old) {
 }
 
 /** Thin lines from a marker to the axes, and its coordinates where they end. */
-function drawCallout(plan, position, x, y, colour) {
+function drawCallout(plan, position, colour) {
   const { g } = plan;
   const [i, k] = plan.axes;
+  const [x, y] = plan.at(position);
   const before = g.globalAlpha;
   g.globalAlpha = before * 0.6;
   g.strokeStyle = colour;
@@ -92,21 +106,8 @@ function drawCallout(plan, position, x, y, colour) {
   g.stroke();
   g.setLineDash([]);
   g.globalAlpha = before;
-  g.font = LABEL;
-  drawTag(plan, number(position[i]), x, plan.bottom + 14, colour, "center");
-  drawTag(plan, number(position[k]), plan.left - 5, y, colour, "right");
-}
-
-function drawTag(plan, text, x, y, colour, align) {
-  const { g } = plan;
-  const width = g.measureText(text).width + 8;
-  const left = align === "right" ? x - width : x - width / 2;
-  g.fillStyle = plan.colours.panel;
-  g.fillRect(left - 1, y - 9, width + 2, 18);
-  g.fillStyle = colour;
-  g.textAlign = "center";
-  g.textBaseline = "middle";
-  g.fillText(text, left + width / 2, y + 0.5);
+  plan.labels.tag(number(position[i]), x, plan.bottom + 14, colour, "center");
+  plan.labels.tag(number(position[k]), plan.left - 5, y, colour, "right");
 }
 
 /** Arrows from the arrays along their estimated directions, to the walls. */
@@ -115,8 +116,10 @@ function drawDirections(plan, { rays, label, newest }, { arrays }, colour, old) 
   for (const { array: name, azimuth, elevation } of rays) {
     const array = arrays.find((each) => each.name === name);
     if (!array || !Number.isFinite(azimuth) || !Number.isFinite(elevation)) continue;
+    const end = rayEnd(array.position, direction(azimuth, elevation), plan.size);
     const [x, y] = plan.at(array.position);
-    const [u, v] = plan.at(rayEnd(array.position, direction(azimuth, elevation), plan.size));
+    const [u, v] = plan.at(end);
+    plan.solid?.drawStem(plan, end, colour, 0.5, [3, 4]);
     const heading = Math.atan2(v - y, u - x);
     g.beginPath();
     g.moveTo(x + 14 * Math.cos(heading), y + 14 * Math.sin(heading));
@@ -128,11 +131,11 @@ function drawDirections(plan, { rays, label, newest }, { arrays }, colour, old) 
     g.setLineDash([10, 5]);
     g.stroke();
     g.setLineDash([]);
-    if (label || (newest && plan.view === "floor")) {
-      g.font = LABEL;
-      g.textAlign = "center";
-      g.textBaseline = "middle";
-      plan.text(label ?? "direction only", x + 0.7 * (u - x), y + 0.7 * (v - y) - 14, colour);
+    if (label || (newest && plan.view !== "side" && plan.view !== "front")) {
+      const spots = [0.7, 0.5, 0.85].flatMap((share) => [-14, 14].map((off) => (
+        { x: x + share * (u - x), y: y + share * (v - y) + off, align: "center" }
+      )));
+      plan.labels.add({ order: ORDER.estimate, lines: [{ text: label ?? "direction only", colour }], spots });
     }
   }
 }
@@ -161,10 +164,10 @@ export function drawTracks(plan, { tracks, now }) {
 }
 
 function drawVelocity(plan, position, velocity) {
-  if (Math.hypot(...plan.axes.map((axis) => velocity[axis])) < LEAST_SPEED) return;
   const { g } = plan;
   const [x, y] = plan.at(position);
   const [u, v] = plan.at(position.map((c, axis) => c + velocity[axis] * ARROW_S));
+  if (Math.hypot(u - x, v - y) < LEAST_SPEED * ARROW_S * plan.scale) return;
   g.beginPath();
   g.moveTo(x, y);
   g.lineTo(u, v);

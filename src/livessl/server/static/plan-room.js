@@ -1,64 +1,73 @@
-// Layers of a plan that show the room: floor, power map, grid, walls and axes.
+// Layers of a plan that show the room: its faces, power maps and grid, and the walls and axes of the fixed views.
 
 import { number } from "./format.js";
 import { opacity } from "./colour-map.js";
+import { ORDER } from "./plan-labels.js";
 import { SMALL } from "./plan-style.js";
+import { onFace } from "./projection.js";
 
 /** Least distance in pixels between lines of the grid, and between labels of an axis. */
 const GRID_GAP = 18;
-const LABEL_GAP = 46;
+export const LABEL_GAP = 46;
 
 /** A step in metres, 1, 2 or 5 times a power of ten, that is at least `gap` pixels wide. */
-function niceStep(pixelsPerMetre, gap) {
+export function niceStep(pixelsPerMetre, gap) {
   const least = gap / pixelsPerMetre;
   const power = 10 ** Math.floor(Math.log10(least));
   return [1, 2, 5, 10].map((k) => k * power).find((step) => step >= least * 0.999);
 }
 
+/** Pixels per metre along each axis of the room, which a turned view shortens. */
+export function axisScales({ projection: { right, up, scale } }) {
+  return right.map((c, axis) => Math.hypot(c, up[axis]) * scale);
+}
+
 /** Place a line one pixel wide on the screen's pixels, so that it is sharp. */
 const sharp = (pixels) => Math.round(pixels) + 0.5;
 
-export function drawFloor(plan) {
-  plan.g.fillStyle = plan.colours.paper;
-  plan.g.fillRect(...plan.room);
+/** The floor of a turned view has the colour of paper, and its walls are a little darker. */
+export function drawFaces(plan) {
+  for (const face of plan.projection.faces(plan.size)) {
+    const [width, height] = face.along.map((axis) => plan.size[axis]);
+    plan.trace([[0, 0], [width, 0], [width, height], [0, height]].map(([u, v]) => onFace(face, u, v)), true);
+    plan.g.fillStyle = plan.flat || face.axis === 2 ? plan.colours.paper : plan.colours.shade;
+    plan.g.fill();
+  }
 }
 
-/** A map of one plane has no height, so it is drawn as high as one cell of the search grid. */
+/** Each face shows the map of its own view. A map of one plane is drawn as high as one cell of the search grid. */
 export function drawMap(plan, { images, cellM, now }) {
-  const { g } = plan;
-  const image = images?.[plan.view];
   const alpha = images ? opacity(now - images.bornMs) : 0;
-  if (!image || alpha <= 0) return;
-  const { left, right, bottom, top } = image.bounds;
-  const [low, high] = [[0, 0, 0], [0, 0, 0]];
-  [[left, right], [bottom, top]].forEach(([from, to], index) => {
-    const margin = to > from ? 0 : cellM / 2;
-    low[plan.axes[index]] = from - margin;
-    high[plan.axes[index]] = to + margin;
-  });
-  g.globalAlpha = alpha;
-  g.imageSmoothingEnabled = true;
-  g.imageSmoothingQuality = "low";
-  g.drawImage(image.canvas, ...plan.box(low, high));
-  g.globalAlpha = 1;
+  if (alpha <= 0) return;
+  plan.g.globalAlpha = alpha;
+  for (const face of plan.projection.faces(plan.size)) {
+    const image = images[face.view];
+    if (!image) continue;
+    const { left, right, bottom, top } = image.bounds;
+    const [u, v] = [right > left ? 0 : cellM / 2, top > bottom ? 0 : cellM / 2];
+    const at = (across, up) => onFace(face, across, up);
+    plan.picture(image.canvas, at(left - u, bottom - v), at(right + u, bottom - v), at(left - u, top + v));
+  }
+  plan.g.globalAlpha = 1;
 }
 
 export function drawGrid(plan) {
-  const { g, size, scale } = plan;
-  const [i, k] = plan.axes;
-  const step = niceStep(scale, GRID_GAP);
+  const { g, size } = plan;
+  const place = ([x, y]) => (plan.flat ? [sharp(x), sharp(y)] : [x, y]);
+  const scales = axisScales(plan);
   g.strokeStyle = plan.colours.grid;
   g.lineWidth = 1;
   g.beginPath();
-  for (let a = step; a < size[i] - 1e-6; a += step) {
-    const x = sharp(plan.left + a * scale);
-    g.moveTo(x, plan.top);
-    g.lineTo(x, plan.bottom);
-  }
-  for (let b = step; b < size[k] - 1e-6; b += step) {
-    const y = sharp(plan.bottom - b * scale);
-    g.moveTo(plan.left, y);
-    g.lineTo(plan.right, y);
+  for (const face of plan.projection.faces(size)) {
+    face.along.forEach((axis, index) => {
+      const end = size[face.along[1 - index]];
+      const step = niceStep(plan.flat ? scales[axis] : Math.min(...face.along.map((each) => scales[each])), GRID_GAP);
+      for (let a = step; a < size[axis] - 1e-6; a += step) {
+        const at = (b) => place(plan.at(index === 0 ? onFace(face, a, b) : onFace(face, b, a)));
+        g.moveTo(...at(0));
+        g.lineTo(...at(end));
+      }
+    });
   }
   g.stroke();
 }
@@ -74,36 +83,29 @@ export function drawWalls(plan) {
 export function drawAxes(plan) {
   const { g, size, scale, left, bottom } = plan;
   const [i, k] = plan.axes;
-  const [calledX, calledY] = plan.called ? plan.at(plan.called.position) : [-Infinity, -Infinity];
+  const colour = plan.colours.muted;
   const step = niceStep(scale, LABEL_GAP);
   const digits = step < 1 ? 1 : 0;
-  g.font = SMALL;
-  g.fillStyle = plan.colours.muted;
+  const label = (text, x, y, align) => plan.labels.add({
+    order: ORDER.axis, font: SMALL, lines: [{ text, colour }], spots: [{ x, y, align }],
+  });
   g.strokeStyle = plan.colours.wall;
   g.lineWidth = 1;
   g.beginPath();
-  g.textAlign = "center";
-  g.textBaseline = "top";
   for (let a = 0; a <= size[i] + 1e-6; a += step) {
     const x = sharp(left + a * scale);
     g.moveTo(x, bottom + 1);
     g.lineTo(x, bottom + 6);
-    if (Math.abs(calledX - x) > 24) g.fillText(number(a, digits), x, bottom + 9);
+    label(number(a, digits), x, bottom + 16, "center");
   }
-  g.textAlign = "right";
-  g.textBaseline = "middle";
   for (let b = 0; b <= size[k] + 1e-6; b += step) {
     const y = sharp(bottom - b * scale);
     g.moveTo(left - 1, y);
     g.lineTo(left - 6, y);
-    if (Math.abs(calledY - y) > 13) g.fillText(number(b, digits), left - 9, y);
+    label(number(b, digits), left - 9, y, "right");
   }
   g.stroke();
   const [rightName, upName] = plan.axisNames;
-  g.textAlign = "center";
-  g.textBaseline = "top";
-  g.fillText(`${rightName} (m)`, (left + plan.right) / 2, bottom + 24);
-  g.textAlign = "right";
-  g.textBaseline = "bottom";
-  g.fillText(`${upName} (m)`, left - 3, plan.top - 9);
+  label(`${rightName} (m)`, (left + plan.right) / 2, bottom + 32, "center");
+  label(`${upName} (m)`, left - 3, plan.top - 18, "right");
 }

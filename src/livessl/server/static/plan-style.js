@@ -1,6 +1,6 @@
 // The plans' fonts, and their colours as base.css gives them for light and dark, so that canvases and page share them.
 
-const NAMES = ["paper", "panel", "grid", "wall", "zone", "text", "muted", "estimate", "marked", "old", "halo"];
+const NAMES = ["paper", "shade", "panel", "grid", "wall", "zone", "text", "muted", "estimate", "marked", "old", "halo"];
 const FACE = '"Segoe UI", Roboto, "Noto Sans", "Helvetica Neue", "Liberation Sans", Arial, sans-serif';
 export const LABEL = `600 12px ${FACE}`;
 export const SMALL = `11px ${FACE}`;
