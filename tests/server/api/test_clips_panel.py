@@ -104,7 +104,7 @@ def test_operator_listens_keeps_and_deletes(
         page.get_by_role("button", name="Delete the recordings").click()
         expect(page.get_by_test_id("clips").first).to_have_attribute("data-state", "none", timeout=1000 * HANG_S)
         assert server.parts.clips is not None
-        assert server.parts.clips.folder.count == 1
+        assert server.parts.clips.folder.figures.count == 1
 
 
 def test_viewer_sees_what_there_is_and_gets_no_button(

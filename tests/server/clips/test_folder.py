@@ -42,9 +42,9 @@ def test_clip_is_stored_read_kept_and_deleted(tmp_path: Path) -> None:
     assert path is not None
     assert path.read_bytes() == SOUND
     assert folder.keep("lab-1", True)
-    assert (folder.count, folder.kept, folder.nbytes) == (1, 1, len(SOUND))
+    assert (folder.figures.count, folder.figures.kept, folder.figures.nbytes) == (1, 1, len(SOUND))
     assert folder.delete("lab-1")
-    assert (folder.count, folder.kept, folder.nbytes) == (0, 0, 0)
+    assert (folder.figures.count, folder.figures.kept, folder.figures.nbytes) == (0, 0, 0)
     assert on_disk(tmp_path) == set()
     assert not folder.delete("lab-1")
     assert not folder.keep("lab-1", True)
@@ -97,7 +97,7 @@ def test_clip_that_is_written_again_stays_kept(tmp_path: Path) -> None:
     clip = folder.read("lab-1")
     assert clip is not None
     assert clip.keep
-    assert folder.nbytes == len(b"longer than before")
+    assert folder.figures.nbytes == len(b"longer than before")
 
 
 def test_restart_finds_the_clips_and_deletes_what_is_unfinished(tmp_path: Path) -> None:
@@ -178,14 +178,14 @@ def test_unreadable_clip_is_told_from_none_counted_and_logged_once(
 ) -> None:
     folder = ClipFolder(tmp_path)
     damaged(folder, tmp_path, content)
-    assert folder.unreadable == 0
+    assert folder.figures.unreadable == 0
     for act in (folder.read, folder.read, lambda event_id: folder.keep(event_id, True)):
         with pytest.raises(UnreadableClipError, match=f"event 'lab-1': expected a clip.json that .*: {why}.*or delete"):
             act("lab-1")
     assert caplog.text.count("server.clips.folder: event 'lab-1': expected a clip.json") == 1
-    assert (folder.unreadable, folder.has("lab-1"), folder.ids()) == (1, True, ["lab-1"])
+    assert (folder.figures.unreadable, folder.has("lab-1"), folder.ids()) == (1, True, ["lab-1"])
     assert folder.delete("lab-1")
-    assert (folder.unreadable, folder.read("lab-1"), on_disk(tmp_path)) == (0, None, set())
+    assert (folder.figures.unreadable, folder.read("lab-1"), on_disk(tmp_path)) == (0, None, set())
 
 
 def test_unreadable_clip_is_replaced_and_what_was_kept_stays_kept(tmp_path: Path) -> None:
@@ -198,7 +198,7 @@ def test_unreadable_clip_is_replaced_and_what_was_kept_stays_kept(tmp_path: Path
     folder.put("lab-1", write(5))
     clip = folder.read("lab-1")
     assert clip is not None
-    assert (clip.keep, folder.unreadable) == (True, 0)
+    assert (clip.keep, folder.figures.unreadable) == (True, 0)
 
 
 @pytest.mark.parametrize("by_age", [True, False])
@@ -374,15 +374,15 @@ def test_clip_that_is_kept_while_old_ones_are_deleted_stays(tmp_path: Path, monk
     folder = ClipFolder(tmp_path)
     for number in (1, 2):
         folder.put(f"lab-{number}", write(number))
-    erase = folder._finish
+    erase = folder._wastebasket.erase
 
     def kept_meanwhile(going: Path) -> None:
         folder.keep("lab-2", True)
         erase(going)
 
-    monkeypatch.setattr(folder, "_finish", kept_meanwhile)
+    monkeypatch.setattr(folder._wastebasket, "erase", kept_meanwhile)
     assert folder.expire(10, 1000) == 1
-    assert (folder.count, folder.kept) == (1, 1)
+    assert (folder.figures.count, folder.figures.kept) == (1, 1)
     assert folder.read("lab-2") is not None
 
 
@@ -407,7 +407,7 @@ def test_expiry_deletes_old_ones_then_the_oldest_and_never_kept_ones(
             left.discard(start)
     gone = folder.expire(before, most)
     assert {start for start in clips if folder.read(f"lab-{start}")} == left
-    assert (gone, folder.count) == (len(clips) - len(left), len(left))
+    assert (gone, folder.figures.count) == (len(clips) - len(left), len(left))
 
 
 def test_clips_that_somebody_has_removed_do_not_count(tmp_path: Path) -> None:
@@ -418,7 +418,7 @@ def test_clips_that_somebody_has_removed_do_not_count(tmp_path: Path) -> None:
     for name in ("lab-0", "lab-1"):
         shutil.rmtree(tmp_path / name)
     assert folder.expire(None, 2 * len(SOUND)) == 0
-    assert (folder.count, folder.nbytes, folder.kept_bytes) == (2, 2 * len(SOUND), 0)
+    assert (folder.figures.count, folder.figures.nbytes, folder.figures.kept_bytes) == (2, 2 * len(SOUND), 0)
     assert folder.read("lab-2") is not None
 
 

@@ -238,10 +238,10 @@ def test_clips_are_deleted_at_their_age_or_with_their_event(
     desk.work()
     desk.clock.ns += days * DAY_NS - 3_600_000_000_000
     desk.work()
-    assert desk.clips.folder.count == 1
+    assert desk.clips.folder.figures.count == 1
     desk.clock.ns += 3_600_000_000_000
     desk.work()
-    assert (desk.clips.folder.count, desk.clips.counts.deleted) == (0, 1)
+    assert (desk.clips.folder.figures.count, desk.clips.counts.deleted) == (0, 1)
 
 
 def test_clips_kept_for_ever_that_leave_no_room_are_a_problem(tmp_path: Path) -> None:
