@@ -111,7 +111,7 @@ def test_restart_finds_the_clips_and_deletes_what_is_unfinished(tmp_path: Path) 
     (tmp_path / "notes.txt").write_text("mine", encoding="utf-8")
     again = ClipFolder(tmp_path)
     again.load()
-    assert (again.count, again.kept, again.nbytes) == (2, 1, 2 * len(SOUND))
+    assert (again.figures.count, again.figures.kept, again.figures.nbytes) == (2, 1, 2 * len(SOUND))
     assert (tmp_path / "foreign").is_dir()
     assert on_disk(tmp_path) == {"lab-1/a.flac", "lab-1/clip.json", "lab-2/a.flac", "lab-2/clip.json", "notes.txt"}
 
@@ -152,7 +152,7 @@ def test_start_goes_on_after_folders_that_cannot_be_read_or_erased(
     monkeypatch.setattr(shutil, "rmtree", broken(f"{PARTIAL}going-lab-1"))
     again = ClipFolder(tmp_path)
     again.load()
-    assert again.count == 1
+    assert again.figures.count == 1
     assert "going-lab-1: cannot be read or deleted: Permission denied; correct its permissions or" in caplog.text
     assert "lab-2: expected a clip with clip.json, got none; it is left alone" in caplog.text
 
@@ -208,8 +208,8 @@ def test_unreadable_clips_outlive_a_restart_and_are_deleted_by_age_and_size(tmp_
     os.utime(tmp_path / "lab-1" / "clip.json", ns=(7, 7))
     again = ClipFolder(tmp_path)
     again.load()
-    assert (again.count, again.unreadable, again.nbytes) == (1, 1, len(SOUND) + len(content))
-    limits = (7, again.nbytes), (8, again.nbytes) if by_age else (7, again.nbytes - 1)
+    assert (again.figures.count, again.figures.unreadable, again.figures.nbytes) == (1, 1, len(SOUND) + len(content))
+    limits = (7, again.figures.nbytes), (8, again.figures.nbytes) if by_age else (7, again.figures.nbytes - 1)
     assert [again.expire(*limit) for limit in limits] == [0, 1]
     assert on_disk(tmp_path) == set()
 
@@ -243,7 +243,7 @@ def test_no_unreadable_clip_that_may_be_kept_is_deleted_after_a_restart(
     again = ClipFolder(path)
     again.load()
     assert again.expire(1 << 62, -1) == 0
-    assert (on_disk(path), again.kept_bytes) == ({"lab-1/clip.json"}, len(content))
+    assert (on_disk(path), again.figures.kept_bytes) == ({"lab-1/clip.json"}, len(content))
 
 
 @pytest.mark.parametrize(("content", "keep"), [(b"", True), (b'{"keep": true}', True), (b'{"keep": false}', False)])
@@ -268,13 +268,18 @@ def test_clip_that_the_disk_refuses_at_the_start_is_left_alone_and_counts_once_i
     with monkeypatch.context() as patch:
         patch.setattr(Path, "open", refused_file("lab-1", number))
         again.load()
-        assert (again.count, again.kept, again.unreadable, again.expire(10, 0)) == (3, 0, 1, 2)
+        assert (again.figures.count, again.figures.kept, again.figures.unreadable, again.expire(10, 0)) == (3, 0, 1, 2)
         with pytest.raises(UnreadableClipError, match=r"be read: .*; correct its permissions, the disk") as caught:
             again.read("lab-1")
         assert os.strerror(number) in str(caught.value)
         assert "delete" not in str(caught.value)
     assert again.expire(10, 0) == 0  # it reads the clip again
-    assert (again.count, again.kept, again.unreadable, again.nbytes) == (1, 1, 0, len(SOUND))
+    assert (again.figures.count, again.figures.kept, again.figures.unreadable, again.figures.nbytes) == (
+        1,
+        1,
+        0,
+        len(SOUND),
+    )
     assert caplog.text.count("clip.json cannot be read") == 1
     again.keep("lab-1", False)
     assert again.expire(10, 0) == 1
@@ -292,9 +297,9 @@ def test_clip_whose_folder_is_refused_at_the_start_counts_once_it_is_read(
     with monkeypatch.context() as patch:
         patch.setattr(again, "_entry", refused)
         again.load()
-        assert again.count == 0
+        assert again.figures.count == 0
     assert again.read("lab-1") is not None
-    assert (again.count, again.kept, again.expire(10, 0)) == (1, 0, 1)
+    assert (again.figures.count, again.figures.kept, again.expire(10, 0)) == (1, 0, 1)
 
 
 def test_clip_that_could_not_be_read_again_is_not_stored(tmp_path: Path) -> None:

@@ -64,7 +64,8 @@ class Evidence:
     async def clip(self, alert: JsonObject, *, waits: bool = True) -> Path | None:
         """Return the clip of an alert's event as soon as it is there, within `CLIP_WAIT_S`.
 
-        None if the site keeps no clips, the alert is about no event, there is none by then, it cannot be read, or it is larger than `MAX_CLIP_BYTES`; without `waits`, if there is none now.
+        None if the site keeps no clips, the alert is about no event, there is none by then, it cannot be read, or it is
+        larger than `MAX_CLIP_BYTES`; without `waits`, if there is none now.
         """
         if self._clips is None or alert["event"] is None:
             return None

@@ -54,8 +54,10 @@ class SpeechError(RunError):
 
 def is_speech(probabilities: FloatArray) -> bool:
     """Return whether the probabilities (n,) of speech in consecutive chunks make speech."""
+    if not len(probabilities):
+        return False
     is_voice = np.asarray(probabilities) >= LEAST_PROBABILITY
-    return bool(np.convolve(is_voice, np.ones(WINDOW)).max(initial=0.0) >= LEAST_CHUNKS)
+    return bool(np.convolve(is_voice, np.ones(WINDOW)).max() >= LEAST_CHUNKS)
 
 
 def levelled(samples: Float32Array, sample_rate_hz: float) -> Float32Array:
