@@ -1,10 +1,10 @@
 """How many clips `privacy: no-speech` drops: those with speech, and those without.
 
-`python benchmarks/speech.py [--positions N] [--seed S] [--write docs/accuracy/speech.md]` takes the project's own sounds
-and, where they are (LIVESSL_DATA), real ones: doors, keys, phones and speech, a talker before an array, and claps in a
-laboratory. Dry sounds are put at random places of a simulated room, and noise is added. Each clip is examined as a
-server does: all microphones of all arrays, and one of them with speech drops it. The enhanced signal, which a server
-examines as well, is left out here.
+`python benchmarks/speech.py [--positions N] [--seed S] [--write docs/accuracy/speech.md]` takes the project's own
+sounds and, where they are (LIVESSL_DATA), real ones: doors, keys, phones and speech, a talker before an array, and
+claps in a laboratory. Dry sounds are put at random places of a simulated room, and noise is added. Each clip is
+examined as a server does: all microphones of all arrays, and one of them with speech drops it. The enhanced signal,
+which a server examines as well, is left out here.
 """
 
 from __future__ import annotations
@@ -42,13 +42,14 @@ VOICES: Final = ("speech", "voice")
 HEAD: Final = """\
 # How many clips are dropped for speech
 
-With `privacy: no-speech` a server stores no [clip](../clips.md#without-speech) in which it detects speech. This page says
-how many it drops. Sounds are at random places in a simulated room of 8 x 10 x 4 m with a reverberation time of
-{rt60_s:g} s and two arrays of four microphones, with white noise at the given ratio (SNR). Each clip begins {pre_ms:.0f} ms
-before its sound, as clips usually do. `python benchmarks/speech.py --positions {positions} --seed {seed} --write
-docs/accuracy/speech.md` writes this page; the real sounds are not part of the project. A clip is dropped if {chunks} of
-{window} consecutive chunks of {chunk_ms:.0f} ms have a probability of speech of {least:g} or more, at any microphone. The
-numbers of the rule were chosen with some of these sounds, in a measured room.
+With `privacy: no-speech` a server stores no [clip](../clips.md#without-speech) in which it detects speech. This page
+says how many it drops. Sounds are at random places in a simulated room of 8 x 10 x 4 m with a reverberation time of
+{rt60_s:g} s and two arrays of four microphones, with white noise at the given ratio (SNR). Each clip begins
+{pre_ms:.0f} ms before its sound, as clips usually do.
+`python benchmarks/speech.py --positions {positions} --seed {seed} --write docs/accuracy/speech.md` writes this page;
+the real sounds are not part of the project. A clip is dropped if {chunks} of {window} consecutive chunks of
+{chunk_ms:.0f} ms have a probability of speech of {least:g} or more, at any microphone. The numbers of the rule were
+chosen with some of these sounds, in a measured room and at one microphone.
 
 | sound | SNR | clips | dropped |
 |---|---|---|---|"""

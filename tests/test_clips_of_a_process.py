@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import httpx
-import numpy as np
 import pytest
 
 from livessl.capture.node import capture_recordings
@@ -19,8 +18,6 @@ from livessl.core.types import FRAME_NS
 from livessl.lab.processes import free_port, wait_until_ready
 from livessl.recordings.assign import AssignedRecording
 from livessl.recordings.recording import MemoryRecording
-from livessl.simulation.scene import make_scene, render
-from livessl.simulation.sounds import voice
 from small_site import (
     HANG_S,
     RATE_HZ,
@@ -32,6 +29,7 @@ from small_site import (
     wait_until,
     write_site,
 )
+from voice_scene import voiced
 
 CLOCK = SystemClock()
 
@@ -91,31 +89,6 @@ def test_clips_of_a_killed_server_are_there_after_its_restart(tmp_path: Path) ->
             assert sound.content[:4] == b"fLaC"
             assert httpx.delete(f"{url}/api/v1/events/{event}/clips", timeout=HANG_S).status_code == 200
         assert list((tmp_path / "clips").iterdir()) == []
-
-
-def voiced(start_ns: int) -> list[AssignedRecording]:
-    """What the arrays of the small site record of a voice in its room."""
-    site = site_of()
-    scene = make_scene(
-        site.room.size_m,
-        rt60_s=0.0,
-        sounds=[("voice", voice(np.random.default_rng(1), RATE_HZ))],
-        count=1,
-        sample_rate_hz=RATE_HZ,
-        c_m_s=site.c_m_s,
-        keep_away_m=[spec.centre_m for spec in site.specs],
-        seed=2,
-        lead_s=0.7,
-    )
-    return [
-        AssignedRecording(
-            spec.name,
-            MemoryRecording(spec.name, float(RATE_HZ), render(scene, spec.microphones_m, seed=n)),
-            start_ns,
-            (1, 2, 3, 4),
-        )
-        for n, spec in enumerate(site.specs)
-    ]
 
 
 def heard_by_one(start_ns: int) -> list[AssignedRecording]:

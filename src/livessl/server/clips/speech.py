@@ -14,7 +14,6 @@ from contextlib import suppress
 from typing import Final
 
 import numpy as np
-from scipy.ndimage import maximum_filter1d, uniform_filter1d
 
 from livessl.core.enhance.align import resampled
 from livessl.core.types import Float32Array, FloatArray
@@ -74,6 +73,8 @@ def levelled(samples: Float32Array, sample_rate_hz: float) -> Float32Array:
     (m,) float32
         Empty if the channel is silent; otherwise at least one chunk long.
     """
+    from scipy.ndimage import maximum_filter1d, uniform_filter1d  # most servers never need it
+
     signal = resampled(np.asarray(samples, dtype=np.float64), sample_rate_hz, RATE_HZ)
     peak = float(np.abs(signal).max(initial=0.0))
     if peak == 0.0:
