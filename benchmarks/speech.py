@@ -10,6 +10,7 @@ which a server examines as well, is left out here.
 from __future__ import annotations
 
 import argparse
+import resource
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +23,7 @@ from tqdm import tqdm
 
 import claps
 from clips import C_M_S, CENTRES_M, PRE_ROLL_S, RATE_HZ, ROOM_M, TAIL_S, microphones_m
-from livessl.core.types import Float32Array
+from livessl.core.types import Float32Array, FloatArray
 from livessl.server.clips.speech import LEAST_CHUNKS, LEAST_PROBABILITY, WINDOW, SpeechDetector
 from livessl.server.clips.speech_main import CHUNK
 from livessl.server.clips.speech_main import RATE_HZ as DETECTOR_HZ
@@ -94,6 +95,24 @@ def loudest(sound: Float32Array, length: int) -> Float32Array:
     return sound[first : first + length]
 
 
+class MeteredDetector(SpeechDetector):
+    """A detector that notes how many seconds of channels it has examined."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.examined_s = 0.0
+
+    def probabilities(self, samples: Float32Array, sample_rate_hz: float) -> FloatArray:
+        """Return the probabilities as the detector does."""
+        self.examined_s += len(samples) / sample_rate_hz
+        return super().probabilities(samples, sample_rate_hz)
+
+    def processor_ms(self) -> float:
+        """Return the processor time, in milliseconds, for each second of a channel; the process must have ended."""
+        used = resource.getrusage(resource.RUSAGE_CHILDREN)
+        return 1e3 * (used.ru_utime + used.ru_stime) / self.examined_s
+
+
 class Examined:
     """Clips by kind, and how many of each kind are dropped."""
 
@@ -159,7 +178,7 @@ def add_recorded(examined: Examined) -> None:
     examined.add("claps", "as recorded", [samples for samples, _ in found], found[0][1])
 
 
-def report(rows: Sequence[Row], positions: int, seed: int) -> str:
+def report(rows: Sequence[Row], positions: int, seed: int, processor_ms: float) -> str:
     """Return the page of the results."""
     head = HEAD.format(
         rt60_s=RT60_S, pre_ms=1e3 * PRE_ROLL_S, positions=positions, seed=seed, chunks=LEAST_CHUNKS, window=WINDOW,
@@ -175,7 +194,8 @@ def report(rows: Sequence[Row], positions: int, seed: int) -> str:
     for what, some in (("with speech", with_speech), ("without speech", without)):
         clips, dropped = sum(row.clips for row in some), sum(row.dropped for row in some)
         sums.append(f"Of all {clips} clips {what}, {dropped} ({100.0 * dropped / clips:.1f} %) are dropped.")
-    return "\n".join([head, *lines, "", *sums]) + "\n"
+    cost = f"The process of the detector took {processor_ms:.0f} ms of processor time for each second of a channel."
+    return "\n".join([head, *lines, "", *sums, cost]) + "\n"
 
 
 def main() -> None:
@@ -185,7 +205,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=2, help="seed of places, sounds and noise (default: 2)")
     parser.add_argument("--write", type=Path, help="file for the page")
     arguments = parser.parse_args()
-    detector = SpeechDetector()
+    detector = MeteredDetector()
     examined = Examined(detector, arguments.seed)
     try:
         add_own(examined, arguments.positions, arguments.seed)
@@ -194,7 +214,7 @@ def main() -> None:
             add_recorded(examined)
     finally:
         detector.close()
-    page = report(examined.rows, arguments.positions, arguments.seed)
+    page = report(examined.rows, arguments.positions, arguments.seed, detector.processor_ms())
     print(page)
     if arguments.write is not None:
         arguments.write.write_text(page, encoding="utf-8")

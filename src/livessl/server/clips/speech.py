@@ -25,7 +25,7 @@ LEAST_PROBABILITY: Final = 0.3
 mistake."""
 
 LEAST_CHUNKS: Final = 3
-"""Chunks within `WINDOW` that make speech: 96 ms, half a syllable. A single one would drop a third of door slams."""
+"""Chunks within `WINDOW` that make speech: 96 ms, half a syllable. A single one would drop many door slams."""
 
 WINDOW: Final = 10
 """Consecutive chunks, 0.32 s, among which speech is looked for: syllables have pauses, and consonants between them."""
