@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
@@ -91,6 +92,25 @@ def test_clips_of_a_killed_server_are_there_after_its_restart(tmp_path: Path) ->
         assert list((tmp_path / "clips").iterdir()) == []
 
 
+def detectors_of(pid: int) -> list[int]:
+    """The processes with a detector of speech that a server has started."""
+    found = []
+    for process in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):  # it has just ended
+            parent = int((process / "stat").read_text().rpartition(")")[2].split()[1])
+            if parent == pid and b"speech_main" in (process / "cmdline").read_bytes():
+                found.append(int(process.name))
+    return found
+
+
+def is_running(pid: int) -> bool:
+    """Whether a process exists, and is more than an entry that nobody has collected."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
+    except OSError:
+        return False
+
+
 def heard_by_one(start_ns: int) -> list[AssignedRecording]:
     """The scene at one array; the other one is as good as silent."""
     north, south = scene_recordings(start_ns)
@@ -140,8 +160,10 @@ def test_server_process_stores_no_speech_but_refused_events_and_says_why_after_a
         metrics = httpx.get(f"{url}/metrics", timeout=HANG_S).text
         assert 'livessl_clips_total{result="with_speech"} ' in metrics
         assert get("health")["privacy"]["mode"] == "no-speech"
+        [detector] = detectors_of(process.pid)
         process.kill()
         process.wait()
+        wait_until(lambda: not is_running(detector), "the end of the detector's process, whose server is gone")
     with started(*command) as process:
         wait_until_ready(url, [process], CLOCK)  # type: ignore[list-item]
         wait_until(lambda: get("clips")["clips"], "the clips of before")

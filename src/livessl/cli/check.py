@@ -39,9 +39,9 @@ def run(arguments: argparse.Namespace) -> int:
         refuse_foreign("--png", [arguments.png], is_own_picture, arguments.site, NO_PICTURE)
     try:
         site = load_site(arguments.site)
-        faults = [*unprotected_addresses(site), *missing_packages(site)]
-        if faults:
-            raise ConfigError([Fault(f"{arguments.site}: {fault.where}", fault.what) for fault in faults])
+        found = [*unprotected_addresses(site), *missing_packages(site)]
+        if found:
+            raise ConfigError([Fault(f"{arguments.site}: {fault.where}", fault.what) for fault in found])
     except ConfigError as error:
         if arguments.json:
             faults = [{"where": fault.where, "what": fault.what} for fault in error.faults]

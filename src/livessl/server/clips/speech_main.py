@@ -11,7 +11,7 @@ import signal
 import struct
 import sys
 from contextlib import suppress
-from typing import BinaryIO, Final
+from typing import IO, Final
 
 import numpy as np
 
@@ -28,7 +28,7 @@ NICENESS: Final = 10
 """Niceness of the process: it works when nothing else does."""
 
 
-def read_exactly(file: BinaryIO, count: int) -> bytes | None:
+def read_exactly(file: IO[bytes], count: int) -> bytes | None:
     """Return a number of bytes of a file; None if it ends before.
 
     Raises
