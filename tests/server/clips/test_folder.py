@@ -16,7 +16,8 @@ from hypothesis import strategies as st
 
 from clip_desk import head, recordings
 from livessl.schema.clips import ClipFile
-from livessl.server.clips.folder import PARTIAL, ClipFolder
+from livessl.server.clips.erase import PARTIAL
+from livessl.server.clips.folder import ClipFolder
 from livessl.server.clips.reader import ClipsError, UnreadableClipError, parsed
 
 SOUND = b"what somebody said"

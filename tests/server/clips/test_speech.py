@@ -13,8 +13,9 @@ import pytest
 import recordings as real
 from clip_desk import ClipDesk
 from livessl.core.types import FRAME_NS, Event, Float32Array, Frame
+from livessl.recordings.sound_file import SoundWriter
 from livessl.schema.clips import MissingReason
-from livessl.server.clips import record, speech
+from livessl.server.clips import speech
 from livessl.server.clips.speech import SpeechDetector, SpeechError, is_speech, levelled
 from livessl.simulation.scene import read_sounds
 from livessl.simulation.sounds import door_slam, dropped_keys, phone, voice
@@ -34,7 +35,8 @@ def detector() -> Iterator[SpeechDetector]:
 def in_quiet(sound: Float32Array, noise_seed: int = 1) -> Float32Array:
     """A sound (n,) between stretches of quiet, with faint noise."""
     whole = np.pad(sound, (RATE_HZ // 2, RATE_HZ // 2)).astype(np.float32)
-    return whole + hiss(len(whole) / RATE_HZ, 1, noise_seed, 1e-3)[0][: len(whole)]
+    noise = hiss(1.0 + len(whole) / RATE_HZ, 1, noise_seed, 1e-3)[0][: len(whole)]
+    return np.asarray(whole + noise, dtype=np.float32)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -146,13 +148,12 @@ def cut(desk: ClipDesk, sound: Float32Array) -> Event:
 
 def test_speech_never_reaches_the_disk_and_the_event_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     opened: list[Path] = []
-    real_writer = record.SoundWriter
 
     def writer(path: Path, *more: Any) -> Any:
         opened.append(path)
-        return real_writer(path, *more)
+        return SoundWriter(path, *more)
 
-    monkeypatch.setattr(record, "SoundWriter", writer)
+    monkeypatch.setattr("livessl.server.clips.record.SoundWriter", writer)
     desk = desk_of(tmp_path)
     event = cut(desk, voice(np.random.default_rng(1), RATE_HZ))
     desk.work()
