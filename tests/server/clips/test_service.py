@@ -124,6 +124,16 @@ def test_refused_event_has_the_arrays_recordings_and_says_why_there_is_no_enhanc
     assert desk.clips.counts.written == 1
 
 
+@pytest.mark.parametrize("requested", [True, False])
+def test_refused_event_has_the_frames_that_were_requested_for_it_and_no_others(tmp_path: Path, requested: bool) -> None:
+    desk, found = desk_of(tmp_path), replace(refused(0), heard_by=("north",))
+    south = [replace(frame, requested=requested) for frame in heard(range(-8, 16), "south")]
+    desk.clips.take([*heard(range(-8, 16)), *south], None)
+    desk.finish(found)
+    desk.work()
+    assert set(desk.files(found)) == {"array-north.flac", *(["array-south.flac"] if requested else [])}
+
+
 def test_direction_only_event_has_a_signal_that_is_beamed_in_its_direction(tmp_path: Path) -> None:
     desk, found = desk_of(tmp_path), event(status=Status.DIRECTION_ONLY)
     desk.clips.take(heard(range(-8, 16)), None)

@@ -128,15 +128,13 @@ class Clips:
         """Take in a final event; it gets a clip if `server.clips.of` has its status, and an array has sound of it."""
         if self._site_time.is_replay or event.status not in self._config.of:
             return
-        used = () if event.estimate is None else event.estimate.arrays
-        names = [name for name in self._specs if name in event.heard_by or name in used]
-        if not names:
+        if _arrays_of(event).isdisjoint(self._specs):
             self._outcomes.left_out(event, MissingReason.WITHOUT_SOUND)
             return
         if not self._has_room(event):
             self._outcomes.left_out(event, MissingReason.SHED)
             return
-        ahead = {name: Ahead.of(clock_offsets, name) for name in names}
+        ahead = {name: Ahead.of(clock_offsets, name) for name in self._specs}
         longest_ns = round(1e9 * self._config.post_s) + SETTLE_NS
         wait_ns = min(max(event.end_ns + longest_ns - self._clock.now_ns(), 0), longest_ns)
         self._waiting.put(Job(event, self._clock.monotonic_ns() + wait_ns, ahead))
@@ -276,10 +274,13 @@ class Clips:
     def _cuts(self, job: Job) -> list[Cut]:
         begin_ns = job.event.start_ns - round(1e9 * self._config.pre_s)
         end_ns = job.event.end_ns + round(1e9 * self._config.post_s)
-        found = (
-            cut(self._specs[name], self._ring.between(name, begin_ns + at.ns, end_ns + at.ns), at.ns, at.frames)
-            for name, at in job.ahead.items()
-        )
+        found, own = [], _arrays_of(job.event)
+        for name, at in job.ahead.items():
+            if name in self._specs and (name in own or job.event.status is Status.REFUSED):
+                frames = self._ring.between(name, begin_ns + at.ns, end_ns + at.ns)
+                # frames that were requested for a refused event are a part of why it was refused
+                if name in own or any(frame.requested for frame in frames):
+                    found.append(cut(self._specs[name], frames, at.ns, at.frames))
         return [each for each in found if each is not None]
 
     def _expire(self) -> None:
@@ -300,6 +301,11 @@ class Clips:
 
     def _delete_old(self, before_ns: int | None) -> None:
         self._outcomes.deleted(self.folder.expire(before_ns, self._config.max_bytes))
+
+
+def _arrays_of(event: Event) -> set[str]:
+    """Return the arrays that detected an event, and those that it was located by."""
+    return {*event.heard_by, *(() if event.estimate is None else event.estimate.arrays)}
 
 
 def _failure(event: Event, error: Exception) -> str:
