@@ -1,4 +1,4 @@
-"""What is known of each stored clip without reading its file: age, size, and whether it may be deleted.
+"""An index of the stored clips: age and size of each, and whether it may be deleted, without reading its file.
 
 It reads and writes no files. `folder` owns the clips, and calls this with its lock held.
 """

@@ -1,4 +1,4 @@
-"""What has become of events that should have a clip: counts since the start, and why single events have none."""
+"""The outcomes of events that should have a clip: counts since the start, and why single events have none."""
 
 from __future__ import annotations
 

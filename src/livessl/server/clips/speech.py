@@ -1,4 +1,4 @@
-"""Whether recordings contain speech. With `privacy: no-speech` nothing is stored before this is known.
+"""A detector of speech in recordings. With `privacy: no-speech` nothing is stored before it has examined them.
 
 The voice activity detector runs in a process of its own (`speech_main`): its library holds the interpreter for
 milliseconds, which would delay the localization. Samples go there through a pipe, and never to a disk.
@@ -35,7 +35,7 @@ LEVELLED_S: Final = 0.25
 divided by the largest sample within it."""
 
 SILENCE: Final = 1e-4
-"""Level, relative to the recording's peak, below which it is not made louder: 80 dB down nobody can hear a voice."""
+"""Level, relative to the recording's peak, below which it is not made louder: 80 dB down a voice cannot be heard."""
 
 PEAK: Final = 0.5
 """Level, of full scale, to which recordings are brought before the detector examines them."""

@@ -1,4 +1,4 @@
-"""What is wrong with the folder of the clips, for the log and for `GET health`."""
+"""The last error of the folder of the clips, for the log and for `GET health`."""
 
 from __future__ import annotations
 
