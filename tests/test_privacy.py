@@ -51,7 +51,7 @@ def test_recording_of_a_meter_is_refused_with_no_speech(tmp_path: Path, capsys: 
 @pytest.mark.parametrize(
     ("changes", "where", "said"),
     [
-        ({"server.listen": True}, "server.listen", "with privacy: no-speech nobody may listen; remove it"),
+        ({"server.listen": True}, "server.listen", "with privacy: no-speech listening is not allowed; remove it"),
         (
             {"nodes.lab-pc.spool": {"directory": "spool"}},
             "nodes.lab-pc.spool.directory",

@@ -11,7 +11,7 @@ const FIRST_CONTACT_MS = 1000;
 /** What a privacy mode means: on the bar, and in its tooltip. */
 const PRIVACY = {
   "positions-only": ["positions only", "No sound is stored"],
-  "no-speech": ["no speech", "Recordings in which speech is detected are not stored, and nobody can listen live"],
+  "no-speech": ["no speech", "Recordings in which speech is detected are not stored, and live listening is refused"],
 };
 const LINK_WORDS = { live: "connected", stale: "stale", down: "offline" };
 
