@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from itertools import count
 from typing import Any, Final
@@ -14,6 +14,7 @@ from websockets.typing import Origin
 from livessl.capture.node import capture_recordings, send_session
 from livessl.clock import SystemClock, UnpacedClock
 from livessl.core.types import FRAME_NS
+from livessl.recordings.assign import AssignedRecording
 from livessl.server.app import Server
 from small_site import HANG_S, running_server, scene_recordings, site_of, wait_until
 
@@ -29,11 +30,16 @@ def located_scene() -> Iterator[Server]:
         yield server
 
 
-def capture_scene(server: Server, published: int = 2) -> None:
-    """Send the scene to the server as a live node does, and wait until so many events are published in all."""
+def capture(server: Server, recordings: Callable[[int], list[AssignedRecording]]) -> None:
+    """Send recordings, which a function makes for their start, to the server as a live node does."""
     node_site = site_of({"nodes.lab-pc.server": server.endpoint})
     start_ns = (CLOCK.now_ns() // FRAME_NS + 20) * FRAME_NS  # in the future: old sound would not be published as live
-    capture_recordings(node_site, "lab-pc", scene_recordings(start_ns), CLOCK, f"run-{next(_RUNS)}", lambda: False)
+    capture_recordings(node_site, "lab-pc", recordings(start_ns), CLOCK, f"run-{next(_RUNS)}", lambda: False)
+
+
+def capture_scene(server: Server, published: int = 2) -> None:
+    """Send the scene to the server as a live node does, and wait until so many events are published in all."""
+    capture(server, scene_recordings)
     wait_until(lambda: server.parts.event_log.published == published, "both events")
 
 

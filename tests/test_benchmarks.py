@@ -17,6 +17,7 @@ import help_time
 import peer_maps
 import peers
 import performance_page
+import speech
 import startup
 from growth import Fit
 from livessl.clock import SystemClock
@@ -221,3 +222,16 @@ def test_files_of_two_machines_make_no_text(tmp_path: Path) -> None:
     files["exactness"] = {**files["exactness"], "machine": {**MACHINE, "cpu": "Another"}}
     with pytest.raises(ValueError, match="of one machine"):
         performance_page.document(write(tmp_path, files))
+
+
+def test_rates_of_dropped_clips_are_summed_by_whether_somebody_speaks() -> None:
+    rows = [
+        speech.Row("speech 20 dB below a door", "30 dB", 20, 19),
+        speech.Row("a talker, take", "as recorded", 1, 1),
+        speech.Row("doorslam", "30 dB", 10, 2),
+    ]
+    page = speech.report(rows, 40, 2, 33.4)
+    assert "| speech 20 dB below a door | 30 dB | 20 | 19 (95 %) |" in page
+    assert "Of all 21 clips with speech, 20 (95.2 %) are dropped." in page
+    assert "Of all 10 clips without speech, 2 (20.0 %) are dropped." in page
+    assert "took 33 ms of processor time" in page

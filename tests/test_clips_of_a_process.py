@@ -1,8 +1,11 @@
-"""Clips of a real server process: they outlive a kill, and nothing unfinished does."""
+"""Clips of a real server process: they outlive a kill, nothing unfinished does, and speech is not stored."""
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -14,14 +17,27 @@ from livessl.capture.node import capture_recordings
 from livessl.clock import SystemClock
 from livessl.core.types import FRAME_NS
 from livessl.lab.processes import free_port, wait_until_ready
-from small_site import HANG_S, scene_recordings, site_of, started, wait_until, write_site
+from livessl.recordings.assign import AssignedRecording
+from livessl.recordings.recording import MemoryRecording
+from small_site import (
+    HANG_S,
+    RATE_HZ,
+    heard,
+    hiss,
+    scene_recordings,
+    site_of,
+    started,
+    wait_until,
+    write_site,
+)
+from voice_scene import voiced
 
 CLOCK = SystemClock()
 
 
 def made(figures: dict[str, Any]) -> int:
     """The number of events whose clips are no longer waited for."""
-    return sum(int(figures[name]) for name in ("written", "shed", "failed", "without_sound"))
+    return sum(int(figures[name]) for name in ("written", "shed", "failed", "without_sound", "with_speech"))
 
 
 pytestmark = [pytest.mark.processes, pytest.mark.timeout(240)]
@@ -74,3 +90,101 @@ def test_clips_of_a_killed_server_are_there_after_its_restart(tmp_path: Path) ->
             assert sound.content[:4] == b"fLaC"
             assert httpx.delete(f"{url}/api/v1/events/{event}/clips", timeout=HANG_S).status_code == 200
         assert list((tmp_path / "clips").iterdir()) == []
+
+
+def detectors_of(pid: int) -> list[int]:
+    """The processes with a detector of speech that a server has started."""
+    found = []
+    for process in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):  # it has just ended
+            parent = int((process / "stat").read_text().rpartition(")")[2].split()[1])
+            if parent == pid and b"speech_main" in (process / "cmdline").read_bytes():
+                found.append(int(process.name))
+    return found
+
+
+def is_running(pid: int) -> bool:
+    """Whether a process exists, and is more than an entry that nobody has collected."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
+    except OSError:
+        return False
+
+
+def heard_by_one(start_ns: int) -> list[AssignedRecording]:
+    """The scene at one array; the other one is as good as silent."""
+    north, south = scene_recordings(start_ns)
+    quiet = hiss(heard("south").shape[1] / RATE_HZ, 4, level=1e-6)
+    return [north, replace(south, recording=MemoryRecording("south", float(RATE_HZ), quiet))]
+
+
+def test_server_process_stores_no_speech_but_refused_events_and_says_why_after_a_restart(tmp_path: Path) -> None:
+    port, endpoint = free_port(), f"tcp://127.0.0.1:{free_port()}"
+    changes = {
+        "privacy": "no-speech",
+        "fusion.min_arrays": 2,
+        "server": {
+            "bind": endpoint,
+            "http": {"port": port},
+            "events_db": "events.sqlite",
+            "clips": {"folder": "clips", "post_s": 0.1},
+        },
+        "nodes.lab-pc.server": endpoint,
+    }
+    command = (sys.executable, "-m", "livessl", "serve", "--site", write_site(tmp_path, changes))
+    url = f"http://127.0.0.1:{port}"
+
+    def get(path: str) -> dict[str, Any]:
+        answer = httpx.get(f"{url}/api/v1/{path}", timeout=HANG_S)
+        assert answer.status_code == 200, answer.text
+        found: dict[str, Any] = answer.json()
+        return found
+
+    def send(make: Callable[[int], list[AssignedRecording]], result: str) -> None:
+        """Send recordings until one of their events has this result: a busy machine can shed clips."""
+        for attempt in range(8):
+            before = made(get("clips"))
+            start_ns = (CLOCK.now_ns() // FRAME_NS + 20) * FRAME_NS
+            run = f"run-{result}-{attempt}"
+            capture_recordings(site_of(changes), "lab-pc", make(start_ns), CLOCK, run, lambda: False)
+            wait_until(lambda: made(get("clips")) > before and not get("clips")["waiting"], "what becomes of them")  # noqa: B023
+            if get("clips")[result]:
+                return
+        raise AssertionError(f"no clip was {result}: {get('clips')}")
+
+    with started(*command) as process:
+        wait_until_ready(url, [process], CLOCK)  # type: ignore[list-item]
+        send(voiced, "with_speech")
+        assert not list((tmp_path / "clips").rglob("*.flac"))
+        send(heard_by_one, "written")
+        metrics = httpx.get(f"{url}/metrics", timeout=HANG_S).text
+        assert 'livessl_clips_total{result="with_speech"} ' in metrics
+        assert get("health")["privacy"]["mode"] == "no-speech"
+        [detector] = detectors_of(process.pid)
+        process.kill()
+        process.wait()
+        wait_until(lambda: not is_running(detector), "the end of the detector's process, whose server is gone")
+    with started(*command) as process:
+        wait_until_ready(url, [process], CLOCK)  # type: ignore[list-item]
+        wait_until(lambda: get("clips")["clips"], "the clips of before")
+        events = {event["id"]: event for event in get("events")["events"]}
+        clips = {event_id: get(f"events/{event_id}/clips") for event_id in events}
+        spoken = [each for each in clips.values() if each["missing"] == "speech"]
+        stored = {event_id: each for event_id, each in clips.items() if each["state"] == "stored"}
+        assert {each["state"] for each in spoken} == {"none"}
+        assert "privacy: no-speech" in spoken[0]["problem"]
+        assert {events[event_id]["status"] for event_id in stored} == {"refused"}
+        for found in stored.values():
+            assert "array-north.flac" in [file["name"] for file in found["files"]]
+            assert "neither a place nor a direction" in found["no_enhanced"]
+        again: list[httpx.Response] = []
+
+        def is_located_again() -> bool:  # a busy server asks to try again
+            path = f"{url}/api/v1/events/{next(iter(stored))}/relocate"
+            again.append(httpx.post(path, json={"method": "onset"}, timeout=HANG_S))
+            return again[-1].status_code != 503
+
+        wait_until(is_located_again, "both answers of the refused event")
+        answer = again[-1].json()
+        assert (answer["stored"]["status"], answer["again"]["status"]) == ("refused", "refused")
+        assert answer["stored"]["reason"] == answer["again"]["reason"]

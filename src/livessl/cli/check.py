@@ -32,16 +32,16 @@ def add_arguments(parser: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
     from livessl.site.build.grid import search_grid
-    from livessl.site.checks import unprotected_addresses
+    from livessl.site.checks import missing_packages, unprotected_addresses
     from livessl.site.load import load_site
 
     if arguments.png is not None:
         refuse_foreign("--png", [arguments.png], is_own_picture, arguments.site, NO_PICTURE)
     try:
         site = load_site(arguments.site)
-        doors = unprotected_addresses(site)
-        if doors:
-            raise ConfigError([Fault(f"{arguments.site}: {door.where}", door.what) for door in doors])
+        found = [*unprotected_addresses(site), *missing_packages(site)]
+        if found:
+            raise ConfigError([Fault(f"{arguments.site}: {fault.where}", fault.what) for fault in found])
     except ConfigError as error:
         if arguments.json:
             faults = [{"where": fault.where, "what": fault.what} for fault in error.faults]

@@ -80,8 +80,13 @@ def _check(arguments: argparse.Namespace) -> Site | None:
     if arguments.site is None:
         return None
     site = load_site(arguments.site)
-    if arguments.listen is not None and site.privacy == "positions-only":
+    if arguments.listen is not None and not site.may_record:
         raise ConfigError(
-            [Fault(f"{arguments.site}: privacy", "positions-only forbids storing sound; remove --listen and --out")]
+            [
+                Fault(
+                    f"{arguments.site}: privacy",
+                    f"{site.privacy} forbids storing {site.forbidden_sound}; remove --listen and --out",
+                )
+            ]
         )
     return site

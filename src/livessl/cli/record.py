@@ -38,9 +38,9 @@ def run(arguments: argparse.Namespace) -> int:
     from livessl.site.load import load_site
 
     site = load_site(arguments.site)
-    if site.privacy == "positions-only":
+    if not site.may_record:
         what = (
-            "expected recording, got positions-only, which forbids storing sound; "
+            f"expected recording, got {site.privacy}, which forbids storing {site.forbidden_sound}; "
             "change it only if everyone in the room agrees"
         )
         raise ConfigError([Fault(f"{arguments.site}: privacy", what)])

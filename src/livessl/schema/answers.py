@@ -36,9 +36,14 @@ class HealthState(StrEnum):
 
 
 class PrivacyMode(StrEnum):
-    """Privacy mode: `recording` permits recordings of sound, `positions-only` forbids them."""
+    """Privacy mode.
+
+    `recording` permits recordings of sound, `no-speech` only clips in which no speech was detected, and
+    `positions-only` none.
+    """
 
     RECORDING = "recording"
+    NO_SPEECH = "no-speech"
     POSITIONS_ONLY = "positions-only"
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from enum import StrEnum
 from typing import Annotated, Literal
 
 from pydantic import ConfigDict, Field
@@ -17,6 +18,29 @@ RecordingName = Annotated[
         examples=["array-north.flac"],
     ),
 ]
+
+
+class MissingReason(StrEnum):
+    """Why an event has no recordings.
+
+    `speech`: speech was detected in them, and `privacy: no-speech` stores none. `status`: `server.clips.of` does not
+    name the event's status. `without_sound`: no frame of it was left. `shed`: too many events waited, or the server was
+    overloaded. `failed`: an error prevented it.
+    """
+
+    SPEECH = "speech"
+    STATUS = "status"
+    WITHOUT_SOUND = "without_sound"
+    SHED = "shed"
+    FAILED = "failed"
+
+
+class MissingClip(Model):
+    """An event without recordings, as a line of `missing.jsonl`."""
+
+    event_id: str = Field(description="Id of the event.")
+    start_ns: int = Field(description="Begin of the event, nanoseconds since the epoch.")
+    reason: MissingReason
 
 
 class ClipBeam(Model):
@@ -65,5 +89,10 @@ class ClipHead(Model):
 
     start_ns: int = Field(description="Begin of the event, nanoseconds since the epoch.")
     keep: bool = Field(description="Whether the recordings are kept for ever.")
-    position_m: PositionM | None = Field(description="Place at which the enhanced signal is beamed; null if none.")
+    position_m: PositionM | None = Field(
+        description="Place, or a place in the direction, at which the enhanced signal is beamed; null if none."
+    )
     files: list[ClipFile] = Field(description="The recordings, the enhanced one first.")
+    no_enhanced: str | None = Field(
+        default=None, description="Why there is no enhanced signal; null if there is one, or if that is not known."
+    )

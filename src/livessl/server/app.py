@@ -28,7 +28,7 @@ from livessl.server.sinks import Sinks
 from livessl.server.store import Store
 from livessl.service_manager import ServiceManager
 from livessl.site.alert_checks import link_secret_file
-from livessl.site.checks import unprotected_addresses
+from livessl.site.checks import missing_packages, unprotected_addresses
 from livessl.site.models import Site
 
 SWITCH_S: Final = 0.0005
@@ -225,9 +225,9 @@ def _usable(site: Site, method: str | None) -> Site:
     Raises
     ------
     ConfigError
-        If the server would be open to the network.
+        If the server would be open to the network, or lacks a package.
     """
-    faults = unprotected_addresses(site)
+    faults = [*unprotected_addresses(site), *missing_packages(site)]
     if faults:
         raise ConfigError(faults)
     if method is None:

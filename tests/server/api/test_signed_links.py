@@ -77,7 +77,7 @@ def running(site: Site) -> Iterator[Server]:
     with running_server(site) as server:
         clips = server.parts.clips
         assert clips is not None
-        wait_until(lambda: clips.folder.count == 1, "the recordings that there are")
+        wait_until(lambda: clips.folder.figures.count == 1, "the recordings that there are")
         yield server
 
 

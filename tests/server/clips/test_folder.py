@@ -16,7 +16,8 @@ from hypothesis import strategies as st
 
 from clip_desk import head, recordings
 from livessl.schema.clips import ClipFile
-from livessl.server.clips.folder import PARTIAL, ClipFolder
+from livessl.server.clips.erase import PARTIAL
+from livessl.server.clips.folder import ClipFolder
 from livessl.server.clips.reader import ClipsError, UnreadableClipError, parsed
 
 SOUND = b"what somebody said"
@@ -42,9 +43,9 @@ def test_clip_is_stored_read_kept_and_deleted(tmp_path: Path) -> None:
     assert path is not None
     assert path.read_bytes() == SOUND
     assert folder.keep("lab-1", True)
-    assert (folder.count, folder.kept, folder.nbytes) == (1, 1, len(SOUND))
+    assert (folder.figures.count, folder.figures.kept, folder.figures.nbytes) == (1, 1, len(SOUND))
     assert folder.delete("lab-1")
-    assert (folder.count, folder.kept, folder.nbytes) == (0, 0, 0)
+    assert (folder.figures.count, folder.figures.kept, folder.figures.nbytes) == (0, 0, 0)
     assert on_disk(tmp_path) == set()
     assert not folder.delete("lab-1")
     assert not folder.keep("lab-1", True)
@@ -97,7 +98,7 @@ def test_clip_that_is_written_again_stays_kept(tmp_path: Path) -> None:
     clip = folder.read("lab-1")
     assert clip is not None
     assert clip.keep
-    assert folder.nbytes == len(b"longer than before")
+    assert folder.figures.nbytes == len(b"longer than before")
 
 
 def test_restart_finds_the_clips_and_deletes_what_is_unfinished(tmp_path: Path) -> None:
@@ -111,7 +112,7 @@ def test_restart_finds_the_clips_and_deletes_what_is_unfinished(tmp_path: Path) 
     (tmp_path / "notes.txt").write_text("mine", encoding="utf-8")
     again = ClipFolder(tmp_path)
     again.load()
-    assert (again.count, again.kept, again.nbytes) == (2, 1, 2 * len(SOUND))
+    assert (again.figures.count, again.figures.kept, again.figures.nbytes) == (2, 1, 2 * len(SOUND))
     assert (tmp_path / "foreign").is_dir()
     assert on_disk(tmp_path) == {"lab-1/a.flac", "lab-1/clip.json", "lab-2/a.flac", "lab-2/clip.json", "notes.txt"}
 
@@ -152,7 +153,7 @@ def test_start_goes_on_after_folders_that_cannot_be_read_or_erased(
     monkeypatch.setattr(shutil, "rmtree", broken(f"{PARTIAL}going-lab-1"))
     again = ClipFolder(tmp_path)
     again.load()
-    assert again.count == 1
+    assert again.figures.count == 1
     assert "going-lab-1: cannot be read or deleted: Permission denied; correct its permissions or" in caplog.text
     assert "lab-2: expected a clip with clip.json, got none; it is left alone" in caplog.text
 
@@ -178,14 +179,14 @@ def test_unreadable_clip_is_told_from_none_counted_and_logged_once(
 ) -> None:
     folder = ClipFolder(tmp_path)
     damaged(folder, tmp_path, content)
-    assert folder.unreadable == 0
+    assert folder.figures.unreadable == 0
     for act in (folder.read, folder.read, lambda event_id: folder.keep(event_id, True)):
         with pytest.raises(UnreadableClipError, match=f"event 'lab-1': expected a clip.json that .*: {why}.*or delete"):
             act("lab-1")
     assert caplog.text.count("server.clips.folder: event 'lab-1': expected a clip.json") == 1
-    assert (folder.unreadable, folder.has("lab-1"), folder.ids()) == (1, True, ["lab-1"])
+    assert (folder.figures.unreadable, folder.has("lab-1"), folder.ids()) == (1, True, ["lab-1"])
     assert folder.delete("lab-1")
-    assert (folder.unreadable, folder.read("lab-1"), on_disk(tmp_path)) == (0, None, set())
+    assert (folder.figures.unreadable, folder.read("lab-1"), on_disk(tmp_path)) == (0, None, set())
 
 
 def test_unreadable_clip_is_replaced_and_what_was_kept_stays_kept(tmp_path: Path) -> None:
@@ -198,7 +199,7 @@ def test_unreadable_clip_is_replaced_and_what_was_kept_stays_kept(tmp_path: Path
     folder.put("lab-1", write(5))
     clip = folder.read("lab-1")
     assert clip is not None
-    assert (clip.keep, folder.unreadable) == (True, 0)
+    assert (clip.keep, folder.figures.unreadable) == (True, 0)
 
 
 @pytest.mark.parametrize("by_age", [True, False])
@@ -208,8 +209,8 @@ def test_unreadable_clips_outlive_a_restart_and_are_deleted_by_age_and_size(tmp_
     os.utime(tmp_path / "lab-1" / "clip.json", ns=(7, 7))
     again = ClipFolder(tmp_path)
     again.load()
-    assert (again.count, again.unreadable, again.nbytes) == (1, 1, len(SOUND) + len(content))
-    limits = (7, again.nbytes), (8, again.nbytes) if by_age else (7, again.nbytes - 1)
+    assert (again.figures.count, again.figures.unreadable, again.figures.nbytes) == (1, 1, len(SOUND) + len(content))
+    limits = (7, again.figures.nbytes), (8, again.figures.nbytes) if by_age else (7, again.figures.nbytes - 1)
     assert [again.expire(*limit) for limit in limits] == [0, 1]
     assert on_disk(tmp_path) == set()
 
@@ -243,7 +244,7 @@ def test_no_unreadable_clip_that_may_be_kept_is_deleted_after_a_restart(
     again = ClipFolder(path)
     again.load()
     assert again.expire(1 << 62, -1) == 0
-    assert (on_disk(path), again.kept_bytes) == ({"lab-1/clip.json"}, len(content))
+    assert (on_disk(path), again.figures.kept_bytes) == ({"lab-1/clip.json"}, len(content))
 
 
 @pytest.mark.parametrize(("content", "keep"), [(b"", True), (b'{"keep": true}', True), (b'{"keep": false}', False)])
@@ -268,13 +269,18 @@ def test_clip_that_the_disk_refuses_at_the_start_is_left_alone_and_counts_once_i
     with monkeypatch.context() as patch:
         patch.setattr(Path, "open", refused_file("lab-1", number))
         again.load()
-        assert (again.count, again.kept, again.unreadable, again.expire(10, 0)) == (3, 0, 1, 2)
+        assert (again.figures.count, again.figures.kept, again.figures.unreadable, again.expire(10, 0)) == (3, 0, 1, 2)
         with pytest.raises(UnreadableClipError, match=r"be read: .*; correct its permissions, the disk") as caught:
             again.read("lab-1")
         assert os.strerror(number) in str(caught.value)
         assert "delete" not in str(caught.value)
     assert again.expire(10, 0) == 0  # it reads the clip again
-    assert (again.count, again.kept, again.unreadable, again.nbytes) == (1, 1, 0, len(SOUND))
+    assert (again.figures.count, again.figures.kept, again.figures.unreadable, again.figures.nbytes) == (
+        1,
+        1,
+        0,
+        len(SOUND),
+    )
     assert caplog.text.count("clip.json cannot be read") == 1
     again.keep("lab-1", False)
     assert again.expire(10, 0) == 1
@@ -292,9 +298,9 @@ def test_clip_whose_folder_is_refused_at_the_start_counts_once_it_is_read(
     with monkeypatch.context() as patch:
         patch.setattr(again, "_entry", refused)
         again.load()
-        assert again.count == 0
+        assert again.figures.count == 0
     assert again.read("lab-1") is not None
-    assert (again.count, again.kept, again.expire(10, 0)) == (1, 0, 1)
+    assert (again.figures.count, again.figures.kept, again.expire(10, 0)) == (1, 0, 1)
 
 
 def test_clip_that_could_not_be_read_again_is_not_stored(tmp_path: Path) -> None:
@@ -374,15 +380,15 @@ def test_clip_that_is_kept_while_old_ones_are_deleted_stays(tmp_path: Path, monk
     folder = ClipFolder(tmp_path)
     for number in (1, 2):
         folder.put(f"lab-{number}", write(number))
-    erase = folder._finish
+    erase = folder._wastebasket.erase
 
     def kept_meanwhile(going: Path) -> None:
         folder.keep("lab-2", True)
         erase(going)
 
-    monkeypatch.setattr(folder, "_finish", kept_meanwhile)
+    monkeypatch.setattr(folder._wastebasket, "erase", kept_meanwhile)
     assert folder.expire(10, 1000) == 1
-    assert (folder.count, folder.kept) == (1, 1)
+    assert (folder.figures.count, folder.figures.kept) == (1, 1)
     assert folder.read("lab-2") is not None
 
 
@@ -407,7 +413,7 @@ def test_expiry_deletes_old_ones_then_the_oldest_and_never_kept_ones(
             left.discard(start)
     gone = folder.expire(before, most)
     assert {start for start in clips if folder.read(f"lab-{start}")} == left
-    assert (gone, folder.count) == (len(clips) - len(left), len(left))
+    assert (gone, folder.figures.count) == (len(clips) - len(left), len(left))
 
 
 def test_clips_that_somebody_has_removed_do_not_count(tmp_path: Path) -> None:
@@ -418,7 +424,7 @@ def test_clips_that_somebody_has_removed_do_not_count(tmp_path: Path) -> None:
     for name in ("lab-0", "lab-1"):
         shutil.rmtree(tmp_path / name)
     assert folder.expire(None, 2 * len(SOUND)) == 0
-    assert (folder.count, folder.nbytes, folder.kept_bytes) == (2, 2 * len(SOUND), 0)
+    assert (folder.figures.count, folder.figures.nbytes, folder.figures.kept_bytes) == (2, 2 * len(SOUND), 0)
     assert folder.read("lab-2") is not None
 
 

@@ -48,7 +48,7 @@ def clips(directory: Path) -> Clips:
 @pytest.fixture
 def copied(clips: Clips, directory: Path, tmp_path: Path) -> Path:
     """A copy of the folder of clips."""
-    assert clips.folder.count
+    assert clips.folder.figures.count
     return Path(shutil.copytree(directory / "clips", tmp_path / "clips"))
 
 

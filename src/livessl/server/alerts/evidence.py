@@ -7,7 +7,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final, Protocol
 
-from livessl.core.types import Status
 from livessl.server.alerts.picture import picture_of
 from livessl.server.api.encode import JsonObject
 from livessl.server.clips.reader import UnreadableClipError
@@ -65,10 +64,10 @@ class Evidence:
     async def clip(self, alert: JsonObject, *, waits: bool = True) -> Path | None:
         """Return the clip of an alert's event as soon as it is there, within `CLIP_WAIT_S`.
 
-        None if the site keeps no clips, the alert is about no event with a position, there is none by then, it cannot
-        be read, or it is larger than `MAX_CLIP_BYTES`; without `waits`, if there is none now.
+        None if the site keeps no clips, the alert is about no event, there is none by then, it cannot be read, or it is
+        larger than `MAX_CLIP_BYTES`; without `waits`, if there is none now.
         """
-        if self._clips is None or alert["event"] is None or alert["event"]["status"] != Status.LOCATED:
+        if self._clips is None or alert["event"] is None:
             return None
         event_id = alert["event"]["id"]
         for look in range(round(CLIP_WAIT_S / LOOK_S)):

@@ -16,12 +16,13 @@ def clip_metrics(parts: Parts) -> Iterator[Metric]:
     clips = parts.clips
     if clips is None:
         return
-    yield GaugeMetricFamily("livessl_clips_stored", "Events with recordings.", clips.folder.count)
-    yield GaugeMetricFamily("livessl_clips_bytes", "Size of all recordings.", clips.folder.nbytes)
+    figures = clips.folder.figures
+    yield GaugeMetricFamily("livessl_clips_stored", "Events with recordings.", figures.count)
+    yield GaugeMetricFamily("livessl_clips_bytes", "Size of all recordings.", figures.nbytes)
     yield GaugeMetricFamily(
         "livessl_clips_unreadable",
         "Events with recordings that could not be read when they were last needed.",
-        clips.folder.unreadable,
+        figures.unreadable,
     )
     yield GaugeMetricFamily("livessl_clips_waiting", "Events whose recordings are being made.", clips.waiting)
     results = CounterMetricFamily(

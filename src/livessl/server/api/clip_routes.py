@@ -14,6 +14,7 @@ from fastapi import APIRouter, HTTPException, Query, Request, Response
 from fastapi.responses import FileResponse
 
 from livessl.schema.answers import errors
+from livessl.schema.clips import MissingReason
 from livessl.server.api import clip_schema
 from livessl.server.api.encode import API_VERSION
 from livessl.server.api.routes import as_json
@@ -34,6 +35,15 @@ _SOUND: Final[dict[int | str, dict[str, Any]]] = {
     416: {"description": "`Range` lies beyond the end.", "content": _TEXT},
 }
 """Answers with sound, by status."""
+
+WHY_MISSING: Final[dict[MissingReason, str]] = {
+    MissingReason.SPEECH: "speech was detected, and privacy: no-speech stores no recordings of it",
+    MissingReason.STATUS: "server.clips.of does not name events of this status",
+    MissingReason.WITHOUT_SOUND: "the server had no frame of its sound left",
+    MissingReason.SHED: "the server was overloaded, or too many events waited for their recordings",
+    MissingReason.FAILED: "an error prevented it; the server's log has it",
+}
+"""Why an event has no recordings, in words."""
 
 _NO_CLIP: Final = "The event has no recordings."
 _NO_FILE: Final = "The event has no recording of that name."
@@ -62,6 +72,7 @@ def _add_lists(router: APIRouter, parts: Parts) -> None:
         limits = {
             "max_bytes": None if config is None else config.max_bytes,
             "max_age_days": None if config is None else config.max_age_days,
+            "of": [] if config is None else list(config.of),
         }
         return as_json({"v": API_VERSION, **state_of(clips), **limits})
 
@@ -71,7 +82,7 @@ def _add_lists(router: APIRouter, parts: Parts) -> None:
         responses=errors(404, 503, texts={404: "There is no event of that id, and no recordings of one."}),
     )
     def get_event_clips(event_id: str) -> Response:
-        """Recordings of an event. Where `state` is `unreadable`, `problem` says why.
+        """Recordings of an event. Where `state` is `unreadable` or `none`, `problem` says why.
 
         Recordings can outlive their event in the history.
         """
@@ -82,16 +93,23 @@ def _add_lists(router: APIRouter, parts: Parts) -> None:
         except UnreadableClipError as error:
             problem = str(error)
         state = _state(clips, event_id, clip, problem)
-        if state == "none" and parts.store.get(event_id) is None:
-            raise HTTPException(404, f"no event {event_id!r}")
+        missing = None
+        if state == "none":
+            event = parts.store.get(event_id)
+            if event is None:
+                raise HTTPException(404, f"no event {event_id!r}")
+            missing = None if clips is None else clips.why_missing(event_id, event["status"])
+            problem = None if missing is None else WHY_MISSING[missing]
         found = {
             "v": API_VERSION,
             "event_id": event_id,
             "state": state,
             "problem": problem,
+            "missing": missing,
             "keep": clip is not None and clip.keep,
             "position_m": None if clip is None else clip.content["position_m"],
             "files": [] if clip is None else clip.files,
+            "no_enhanced": None if clip is None else clip.content.get("no_enhanced"),
             "methods": list(known_methods(parts.site)) if clip is not None and is_relocatable(clip) else [],
         }
         return as_json(found)
@@ -109,7 +127,7 @@ def _add_changes(router: APIRouter, clips: Clips | None) -> None:
         """Keep an event's recordings for ever, or no longer; for operators."""
         with _disk_errors(), _unreadable():
             if clips is None or not clips.folder.keep(event_id, switch.keep):
-                raise _no_clip(event_id)
+                raise no_clip(event_id, clips)
         what = "keeps" if switch.keep else "no longer keeps"
         _log.info("%r %s the clips of %r", request.scope["client_name"], what, event_id)
         return as_json({"v": API_VERSION, "event_id": event_id, "keep": switch.keep})
@@ -126,7 +144,7 @@ def _add_changes(router: APIRouter, clips: Clips | None) -> None:
         """
         with _disk_errors():
             if clips is None or not clips.folder.delete(event_id):
-                raise _no_clip(event_id)
+                raise no_clip(event_id, clips)
         _log.info("%r has deleted the clips of %r", request.scope["client_name"], event_id)
         return as_json({"v": API_VERSION, "event_id": event_id})
 
@@ -146,7 +164,7 @@ def _add_recordings(router: APIRouter, clips: Clips | None) -> None:
         if path is None:
             if clips is not None and clips.is_waiting(event_id):
                 raise HTTPException(404, f"the recordings of event {event_id!r} are being made; try again in seconds")
-            raise _no_clip(event_id)
+            raise no_clip(event_id, clips)
         return _sound_file(path, f"{event_id}-{path.name}")
 
     @router.get(
@@ -189,8 +207,11 @@ def _state(clips: Clips | None, event_id: str, clip: Clip | None, problem: str |
     return "waiting" if clips is not None and clips.is_waiting(event_id) else "none"
 
 
-def _no_clip(event_id: str) -> HTTPException:
-    return HTTPException(404, f"event {event_id!r} has no recordings")
+def no_clip(event_id: str, clips: Clips | None) -> HTTPException:
+    """Return the answer that an event has no recordings, and why, if that is known."""
+    missing = None if clips is None else clips.why_missing(event_id, None)
+    why = "" if missing is None else f": {WHY_MISSING[missing]}"
+    return HTTPException(404, f"event {event_id!r} has no recordings{why}")
 
 
 @contextmanager

@@ -6,7 +6,8 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from livessl.schema.clips import ClipFile
+from livessl.core.states import Status
+from livessl.schema.clips import ClipFile, MissingReason
 from livessl.schema.values import PositionM, Version
 
 
@@ -22,12 +23,21 @@ class EventClips(BaseModel):
     )
     problem: str | None = Field(
         default=None,
-        description="Why the recordings are `unreadable`, and what to do; null otherwise, and from older servers.",
+        description="Why the recordings are `unreadable`, and what to do, or why there are none as far as that is "
+        "known; null otherwise, and from older servers.",
         examples=[None],
     )
+    missing: MissingReason | None = Field(
+        default=None, description="Why there are no recordings, if that is known.", examples=[None]
+    )
     keep: bool = Field(description="Whether the recordings are kept for ever.")
-    position_m: PositionM | None = Field(description="Place at which the enhanced signal is beamed; null if none.")
+    position_m: PositionM | None = Field(
+        description="Place, or a place in the direction, at which the enhanced signal is beamed; null if none."
+    )
     files: list[ClipFile] = Field(description="The recordings, the enhanced one first.")
+    no_enhanced: str | None = Field(
+        default=None, description="Why there is no enhanced signal; null if there is one, or if that is not known."
+    )
     methods: list[str] = Field(
         description="Methods by which `POST events/{id}/relocate` can locate the event again; empty if it cannot.",
         examples=[["onset", "srp-phat"]],
@@ -42,6 +52,7 @@ class ClipsState(BaseModel):
     clips: int = Field(ge=0, description="Events with recordings.")
     bytes: int = Field(ge=0, description="Size of all recordings.")
     max_bytes: int | None = Field(description="Size beyond which the oldest are deleted; null if not enabled.")
+    of: list[Status] = Field(description="Statuses of the events that get recordings; empty if not enabled.")
     max_age_days: float | None = Field(description="Age at which recordings are deleted; null for none.")
     kept: int = Field(ge=0, description="Events whose recordings are kept for ever.")
     unreadable: int = Field(
@@ -52,6 +63,9 @@ class ClipsState(BaseModel):
     written: int = Field(ge=0, description="Events whose recordings were stored.")
     incomplete: int = Field(ge=0, description="Of those, events of which frames of an array are missing.")
     without_sound: int = Field(ge=0, description="Events of which no frame was left.")
+    with_speech: int = Field(
+        ge=0, description="Events without recordings because speech was detected in them (`privacy: no-speech`)."
+    )
     shed: int = Field(ge=0, description="Events without recordings because too many waited, or because of overload.")
     failed: int = Field(ge=0, description="Events without recordings because of an error.")
     deleted: int = Field(ge=0, description="Events whose recordings were deleted because of age or lack of space.")

@@ -12,6 +12,7 @@ from fastapi import APIRouter, HTTPException, Query, Request, Response
 from livessl.errors import ConfigError
 from livessl.schema import relocation
 from livessl.schema.answers import errors
+from livessl.server.api.clip_routes import no_clip
 from livessl.server.api.encode import API_VERSION, JsonObject, answer, std_m
 from livessl.server.api.queries import unprocessable
 from livessl.server.api.routes import as_json
@@ -74,6 +75,8 @@ def _add_relocation(router: APIRouter, parts: Parts) -> None:
             raise HTTPException(404, f"event {event_id!r} has no recordings: {_why_none(parts)}")
         if clips.is_waiting(event_id):
             raise HTTPException(409, f"the recordings of {event_id!r} are being made; try again in some seconds")
+        if not clips.folder.has(event_id) and clips.why_missing(event_id, None) is not None:
+            raise no_clip(event_id, clips)
         with _refusals():
             found, site, took_s = relocator.relocate(event_id, method, wanted.set_up)
         _log.info("%r has located %r again by %r", request.scope["client_name"], event_id, method)

@@ -7,46 +7,19 @@ from __future__ import annotations
 
 import logging
 import os
-import shutil
 import threading
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import orjson
 
-from livessl.server.clips.reader import (
-    ABOUT,
-    SAFE,
-    Clip,
-    ClipDiskError,
-    ClipReader,
-    ClipsError,
-    UnreadableClipError,
-    parsed,
-)
+from livessl.server.clips.erase import PARTIAL, Wastebasket, erase, write_through
+from livessl.server.clips.index import ClipIndex, Entry, Figures
+from livessl.server.clips.reader import ABOUT, SAFE, Clip, ClipReader, ClipsError, UnreadableClipError, parsed
 
-PARTIAL: Final = ".partial-"
-"""Beginning of the name of a folder that is being written or deleted."""
-
-_ZEROS: Final = bytes(1 << 16)
 _log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, slots=True)
-class _Entry:
-    """The properties of a clip that decide its retention; `keep` is None while it is unknown."""
-
-    start_ns: int
-    nbytes: int
-    keep: bool | None
-
-    @property
-    def stays(self) -> bool:
-        """True if the clip is deleted neither by age nor for space: it is kept for ever, or may be."""
-        return self.keep is not False
 
 
 class ClipFolder(ClipReader):
@@ -66,20 +39,9 @@ class ClipFolder(ClipReader):
     def __init__(self, path: Path) -> None:
         super().__init__(path)
         self._lock = threading.RLock()
-        self._erasing = threading.Lock()  # is never held while waiting for the other lock
-        self._entries: dict[str, _Entry] = {}
-        self._unreadable: dict[str, str] = {}  # reasons
-        self._unread: set[str] = set()  # clips that the disk has refused, and are tried again
-        try:
-            path.mkdir(mode=0o700, parents=True, exist_ok=True)
-            probe = path / f"{PARTIAL}probe"
-            probe.touch()
-            probe.unlink()
-        except OSError as error:
-            reason = error.strerror or str(error)
-            raise ClipsError(
-                f"server.clips.folder: cannot write {path}: {reason}; name a folder in which the server may write"
-            ) from error
+        self._index = ClipIndex()  # is changed with the lock held
+        self._wastebasket = Wastebasket(path)
+        _make(path)
 
     def load(self) -> None:
         """Read what is there, and delete what a killed server has left unfinished; what fails is left, and logged.
@@ -96,7 +58,8 @@ class ClipFolder(ClipReader):
             try:
                 self._load(folder)
             except OSError as error:
-                self._unread.add(folder.name)
+                with self._lock:
+                    self._index.put_refused_by_disk(folder.name)
                 _log.warning(
                     "%s: cannot be read or deleted: %s; correct its permissions or delete it",
                     folder,
@@ -105,23 +68,23 @@ class ClipFolder(ClipReader):
 
     def _load(self, folder: Path) -> None:
         if folder.name.startswith(PARTIAL):
-            self._finish(folder)
+            self._wastebasket.erase(folder)
         elif folder.is_dir():
             with self._lock:  # an operator may delete it meanwhile
                 if self.has(folder.name):
-                    self._entries[folder.name] = self._entry(folder)
+                    self._index.put(folder.name, self._entry(folder))
                     return
             _log.warning("%s: expected a clip with %s, got none; it is left alone", folder, ABOUT)
 
-    def _entry(self, folder: Path) -> _Entry:
+    def _entry(self, folder: Path) -> Entry:
         keep: bool | None = None
         try:
             if clip := self.read(folder.name):
-                return _entry_of(clip)
+                return Entry.of(clip)
         except UnreadableClipError as error:
             keep = error.keep
         sizes = [path.stat().st_size for path in folder.iterdir()]
-        return _Entry((folder / ABOUT).stat().st_mtime_ns, sum(sizes), keep)
+        return Entry((folder / ABOUT).stat().st_mtime_ns, sum(sizes), keep)
 
     def read(self, event_id: str) -> Clip | None:
         """Return an event's clip as `ClipReader` does; one that is unreadable is counted, and logged once.
@@ -132,58 +95,21 @@ class ClipFolder(ClipReader):
             clip = super().read(event_id)
         except UnreadableClipError as error:
             with self._lock:
-                is_known = self._unreadable.get(event_id) == str(error)
-                self._unreadable[event_id] = str(error)
-                self._note_unreadable(event_id, error)
-            if not is_known:
+                is_new = self._index.put_unreadable(event_id, error)
+            if is_new:
                 _log.warning("server.clips.folder: %s", error)
             raise
-        if event_id in self._unreadable or (clip is not None and event_id not in self._entries):
+        if self._index.is_outdated(event_id, clip is not None):
             with self._lock:
                 clip = super().read(event_id)  # it may have been kept, replaced or deleted just before
-                self._unreadable.pop(event_id, None)
-                self._unread.discard(event_id)
-                if clip is not None:
-                    self._entries[event_id] = _entry_of(clip)
+                self._index.put_read(event_id, clip)
         return clip
 
-    def _note_unreadable(self, event_id: str, error: UnreadableClipError) -> None:
-        """Note whether to try again, and what is known of whether the clip is kept; the lock is held."""
-        if isinstance(error, ClipDiskError):
-            self._unread.add(event_id)
-            return
-        self._unread.discard(event_id)
-        entry = self._entries.get(event_id)
-        if entry is not None and entry.keep is None:
-            self._entries[event_id] = replace(entry, keep=error.keep)
-
     @property
-    def unreadable(self) -> int:
-        """Number of clips that could not be read when they were last needed."""
-        return len(self._unreadable)
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes of all recordings."""
+    def figures(self) -> Figures:
+        """Number and size of the clips now."""
         with self._lock:
-            return sum(entry.nbytes for entry in self._entries.values())
-
-    @property
-    def count(self) -> int:
-        """Number of events with a clip."""
-        return len(self._entries)
-
-    @property
-    def kept(self) -> int:
-        """Number of clips that are kept for ever."""
-        with self._lock:
-            return sum(entry.keep is True for entry in self._entries.values())
-
-    @property
-    def kept_bytes(self) -> int:
-        """Bytes of the clips that neither age nor room deletes: they are kept for ever, or may be."""
-        with self._lock:
-            return sum(entry.nbytes for entry in self._entries.values() if entry.stays)
+            return self._index.figures
 
     def put(self, event_id: str, write: Callable[[Path], Mapping[str, Any]]) -> Clip:
         """Store a clip in place of an earlier one of the same event; it is kept for ever if that one was, or may be.
@@ -207,21 +133,23 @@ class ClipFolder(ClipReader):
         if not SAFE.fullmatch(event_id):
             raise ValueError(f"clip: expected an event id of letters, digits, '.', '_' or '-', got {event_id!r}")
         partial = self._path / f"{PARTIAL}{event_id}"
-        _erase(partial)
+        erase(partial)
         try:
             partial.mkdir(mode=0o700)
             about = dict(write(partial))
             with self._lock:
-                clip = self._written(partial / ABOUT, event_id, about | {"keep": self._is_kept(event_id)})
+                clip = _written(
+                    partial / ABOUT, event_id, self._path / event_id, about | {"keep": self._is_kept(event_id)}
+                )
                 going = self._set_aside(event_id)
                 partial.rename(clip.path)
-                self._entries[event_id] = _entry_of(clip)
+                self._index.put(event_id, Entry.of(clip))
         except BaseException:
             with suppress(OSError):
-                _erase(partial)
+                erase(partial)
             raise
         if going is not None:
-            self._finish(going)
+            self._wastebasket.erase(going)
         return clip
 
     def keep(self, event_id: str, keep: bool) -> bool:
@@ -238,23 +166,16 @@ class ClipFolder(ClipReader):
             if clip is None:
                 return False
             fresh = clip.path / f"{PARTIAL}{ABOUT}"
-            clip = self._written(fresh, event_id, {**clip.content, "keep": keep})
+            clip = _written(fresh, event_id, clip.path, {**clip.content, "keep": keep})
             fresh.replace(clip.path / ABOUT)
-            self._entries[event_id] = _entry_of(clip)
+            self._index.put(event_id, Entry.of(clip))
             return True
-
-    def _written(self, path: Path, event_id: str, about: Mapping[str, Any]) -> Clip:
-        """Write the file about a clip through to the disk, if it can be read again."""
-        data = orjson.dumps(about)
-        clip = parsed(event_id, self._path / event_id, data)
-        _write_through(path, data)
-        return clip
 
     def _is_kept(self, event_id: str) -> bool:
         try:
             clip = self.read(event_id)
         except UnreadableClipError as error:
-            entry = self._entries.get(event_id)
+            entry = self._index.get(event_id)
             said = {error.keep, None if entry is None else entry.keep}
             return True in said or False not in said
         return clip is not None and clip.keep
@@ -269,7 +190,7 @@ class ClipFolder(ClipReader):
         """
         going = self._set_aside(event_id)
         if going is not None:
-            self._finish(going)
+            self._wastebasket.erase(going)
         return going is not None
 
     def erase_left(self) -> None:
@@ -280,18 +201,12 @@ class ClipFolder(ClipReader):
         OSError
             If one of them cannot be erased; the others are.
         """
-        failed: OSError | None = None
-        for going in self._path.glob(f"{PARTIAL}going-*"):
-            try:
-                self._finish(going)
-            except OSError as error:
-                failed = error
-        if failed is not None:
-            raise failed
+        self._wastebasket.empty()
 
     def expire(self, before_ns: int | None, most_bytes: int) -> int:
-        """Delete clips of events that began before a time, and the oldest ones beyond a number of bytes.
+        """Delete clips of events that began before a time, and then more of them beyond a number of bytes.
 
+        There the clips of refused events go first, and the oldest first.
         Clips that are kept for ever stay, and unreadable ones of which that cannot be known. Those that the disk has
         refused are read again first. Clips whose folders somebody has removed do not count any more. Return the number
         of clips that were deleted.
@@ -302,99 +217,82 @@ class ClipFolder(ClipReader):
             If a file cannot be deleted; the other clips are.
         """
         self._try_again()
-        with self._lock:
-            self._forget_removed()
-            excess = self.nbytes - most_bytes
-            oldest_first = sorted(self._entries.items(), key=lambda item: item[1].start_ns)
         gone, failed = 0, None
-        for event_id, entry in oldest_first:
-            is_old = before_ns is not None and entry.start_ns < before_ns
-            if not entry.stays and (is_old or excess > 0):
-                try:
-                    going = self._set_aside(event_id, entry)
-                    if going is None:  # it was kept, replaced or deleted meanwhile
-                        continue
-                    excess -= entry.nbytes
-                    gone += 1
-                    self._finish(going)
-                except OSError as error:
-                    failed = error
+        with self._lock:  # so that no folder is just being replaced
+            self._index.forget_all_but({folder.name for folder in os.scandir(self._path)})
+            too_old = self._index.expired(before_ns)
+        for event_id, entry in too_old:
+            deleted, error = self._delete_expected(event_id, entry)
+            gone, failed = gone + deleted, error or failed
+        with self._lock:
+            excess, for_room = self._index.figures.nbytes - most_bytes, self._index.by_room()
+        for event_id, entry in for_room:
+            if excess <= 0:
+                break
+            deleted, error = self._delete_expected(event_id, entry)
+            excess -= entry.nbytes if deleted else 0
+            gone, failed = gone + deleted, error or failed
         if failed is not None:
             raise failed
         return gone
 
-    def _set_aside(self, event_id: str, expected: _Entry | None = None) -> Path | None:
+    def _delete_expected(self, event_id: str, entry: Entry) -> tuple[bool, OSError | None]:
+        """Delete a clip unless it was kept, replaced or deleted meanwhile; return whether it is gone, and what failed.
+
+        A clip that is gone and could not be erased is erased later.
+        """
+        going = None
+        try:
+            going = self._set_aside(event_id, entry)
+            if going is not None:
+                self._wastebasket.erase(going)
+        except OSError as error:
+            return going is not None, error
+        return going is not None, None
+
+    def _set_aside(self, event_id: str, expected: Entry | None = None) -> Path | None:
         """Make a clip disappear at once by renaming its folder; return the folder, which is yet to be erased.
 
         None if there is no clip, or not the expected one.
         """
         with self._lock:
-            if not self.has(event_id) or (expected is not None and self._entries.get(event_id) != expected):
+            if not self.has(event_id) or (expected is not None and self._index.get(event_id) != expected):
                 return None
-            going = self._path / f"{PARTIAL}going-{event_id}"
-            self._finish(going)
+            going = self._wastebasket.place_of(event_id)
+            self._wastebasket.erase(going)
             (self._path / event_id).rename(going)
-            self._entries.pop(event_id, None)
-            self._unreadable.pop(event_id, None)
-            self._unread.discard(event_id)
+            self._index.forget(event_id)
             return going
 
     def _try_again(self) -> None:
         """Read the clips again that the disk has refused; what fails still has been logged, and is left alone."""
-        for event_id in sorted(self._unread):
+        for event_id in self._index.unread:
             with suppress(OSError, UnreadableClipError):
                 self.read(event_id)
 
-    def _forget_removed(self) -> None:
-        """Forget the clips whose folders are gone; the lock is held, so that none of them is just being replaced."""
-        there = {folder.name for folder in os.scandir(self._path)}
-        for known in (self._entries, self._unreadable):
-            for event_id in known.keys() - there:
-                del known[event_id]
-        self._unread &= there
 
-    def _finish(self, going: Path) -> None:
-        """Erase a folder that was set aside; two threads may do so at once."""
-        with self._erasing:
-            _erase(going)
+def _make(path: Path) -> None:
+    """Make the folder of all clips, and see whether it can be written.
 
-
-def _entry_of(clip: Clip) -> _Entry:
-    return _Entry(clip.start_ns, clip.nbytes, clip.keep)
-
-
-def _write_through(path: Path, data: bytes) -> None:
-    """Write a file to the disk itself, so that its content is there before a rename, even if the power fails."""
-    with path.open("wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-
-
-def _erase(folder: Path) -> None:
-    """Overwrite a folder's files with zeros and delete it; on some disks and file systems copies remain.
-
-    A file that cannot be overwritten is deleted nevertheless.
+    Raises
+    ------
+    ClipsError
     """
-    if not folder.exists():
-        return
-    for path in folder.rglob("*"):
-        try:
-            if path.is_file() and not path.is_symlink():
-                _overwrite(path)
-        except OSError as error:
-            _log.warning(
-                "%s: deleted without being overwritten: %s; its sound may remain on the disk, check the disk",
-                path,
-                error.strerror or error,
-            )
-    shutil.rmtree(folder) if folder.is_dir() else folder.unlink()
+    try:
+        path.mkdir(mode=0o700, parents=True, exist_ok=True)
+        probe = path / f"{PARTIAL}probe"
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise ClipsError(
+            f"server.clips.folder: cannot write {path}: {reason}; name a folder in which the server may write"
+        ) from error
 
 
-def _overwrite(path: Path) -> None:
-    left = path.stat().st_size
-    with path.open("r+b") as file:
-        while left > 0:
-            left -= file.write(_ZEROS[:left])
-        file.flush()
-        os.fsync(file.fileno())
+def _written(path: Path, event_id: str, folder: Path, about: Mapping[str, Any]) -> Clip:
+    """Write the file about a clip through to the disk, if it can be read again."""
+    data = orjson.dumps(about)
+    clip = parsed(event_id, folder, data)
+    write_through(path, data)
+    return clip

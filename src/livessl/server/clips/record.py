@@ -1,4 +1,4 @@
-"""Writes one event's clip: a file of each array, and one signal enhanced by beams towards the event's position."""
+"""Makes one event's clip in memory, then writes it: each array, and one signal beamed towards the event's position."""
 
 from __future__ import annotations
 
@@ -26,6 +26,12 @@ MOST_GAIN: Final = 1000.0
 """Largest gain, 60 dB, by which the enhanced signal is made louder."""
 
 
+OFF: Final = "the site file has turned it off (server.clips.enhanced)"
+NO_PLACE: Final = "the event has neither a place nor a direction to which a beam could be steered"
+NO_FRAMES: Final = "no frame of the event itself is left of the arrays that it was located by"
+"""Why a clip has no enhanced signal."""
+
+
 @dataclass(frozen=True, slots=True)
 class Recipe:
     """An event, and the recordings that its clip is made of.
@@ -47,7 +53,55 @@ class Recipe:
     c_m_s: float
 
 
-def write_clip(recipe: Recipe, folder: Path) -> dict[str, Any]:
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """A recording in memory, which is still to be written.
+
+    Parameters
+    ----------
+    name : str
+        Name of its file.
+    format : "flac" or "wav"
+    samples : (K, n) float32
+    sample_rate_hz : float
+    about : mapping
+        Its description, as `ClipFile` has it, but for what follows from the samples and the file.
+    """
+
+    name: str
+    format: Format
+    samples: Float32Array
+    sample_rate_hz: float
+    about: Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Made:
+    """The recordings of a clip in memory, the enhanced one first.
+
+    Parameters
+    ----------
+    recipe : Recipe
+    recordings : tuple of Recording
+    no_enhanced : str or None
+        Why there is no enhanced signal; None if there is one.
+    """
+
+    recipe: Recipe
+    recordings: tuple[Recording, ...]
+    no_enhanced: str | None
+
+
+def make_clip(recipe: Recipe) -> Made:
+    """Return the recordings of a clip; nothing is written."""
+    arrays = [_array(recipe.event, cut) for cut in recipe.cuts]
+    enhanced = _enhanced(recipe) if recipe.enhanced else OFF
+    if isinstance(enhanced, str):
+        return Made(recipe, tuple(arrays), enhanced)
+    return Made(recipe, (enhanced, *arrays), None)
+
+
+def write_clip(made: Made, folder: Path) -> dict[str, Any]:
     """Write the recordings of a clip into a folder, and return their description for JSON.
 
     Raises
@@ -55,11 +109,7 @@ def write_clip(recipe: Recipe, folder: Path) -> dict[str, Any]:
     OSError
         If the disk does not take them.
     """
-    event = recipe.event
-    files = [_write_array(event, cut, folder) for cut in recipe.cuts]
-    if recipe.enhanced:
-        made = _write_enhanced(recipe, folder)
-        files = files if made is None else [made, *files]
+    event, recipe = made.recipe.event, made.recipe
     estimate = event.estimate
     return {
         "event_id": event.id,
@@ -67,7 +117,8 @@ def write_clip(recipe: Recipe, folder: Path) -> dict[str, Any]:
         "time_utc": utc_text(event.start_ns),
         "duration_s": round(event.duration_s, 6),
         "position_m": None if estimate is None else [round(float(x), 4) for x in estimate.position_m],
-        "files": files,
+        "files": [_write(recording, folder) for recording in made.recordings],
+        "no_enhanced": made.no_enhanced,
         "answer": answer(event),
         "c_m_s": recipe.c_m_s,
         "arrays": {cut.spec.name: _set_up_and_frames(cut) for cut in recipe.cuts},
@@ -85,15 +136,12 @@ def _set_up_and_frames(cut: Cut) -> dict[str, Any]:
     }
 
 
-def _write_array(event: Event, cut: Cut, folder: Path) -> dict[str, Any]:
+def _array(event: Event, cut: Cut) -> Recording:
     kind: Format = "flac" if len(cut.samples) <= FLAC_MAX_CHANNELS else "wav"
-    name = f"array-{cut.spec.name}.{kind}"
     pre_roll_s = (event.start_ns - cut.time_ns) / 1e9
-    return {
-        "name": name,
+    about = {
         "kind": "array",
         "array": cut.spec.name,
-        **_write(folder / name, cut.samples, cut.sample_rate_hz, kind),
         "time_utc": utc_text(cut.time_ns),
         "pre_roll_s": round(pre_roll_s, 4),
         "post_roll_s": round(cut.duration_s - pre_roll_s - event.duration_s, 4),
@@ -101,28 +149,26 @@ def _write_array(event: Event, cut: Cut, folder: Path) -> dict[str, Any]:
         "gain_db": 0.0,
         "beams": [],
     }
+    return Recording(f"array-{cut.spec.name}.{kind}", kind, cut.samples, cut.sample_rate_hz, about)
 
 
-def _write_enhanced(recipe: Recipe, folder: Path) -> dict[str, Any] | None:
-    """Write the enhanced signal from the arrays that the estimate used; None if none of them has sound."""
+def _enhanced(recipe: Recipe) -> Recording | str:
+    """Return the enhanced signal from the arrays that the estimate used; in words, why there is none."""
     event, estimate = recipe.event, recipe.event.estimate
     if estimate is None:
-        return None
+        return NO_PLACE
     used = [cut for cut in recipe.cuts if cut.spec.name in estimate.arrays]
     sounds = [cut.sound(event.start_ns, event.end_ns) for cut in used]
     sounds = [sound for sound in sounds if sound.sound.any()]
     if not sounds:
-        return None
+        return NO_FRAMES
     made = plan(sounds, estimate.position_m, recipe.c_m_s)
     signal = made.apply({sound.spec.name: sound.samples for sound in sounds})
     gain = _gain(signal)
-    samples = np.asarray(gain * signal[None], dtype=np.float32)
     pre_roll_s = (event.start_ns - made.time_ns) / 1e9
-    return {
-        "name": ENHANCED,
+    about = {
         "kind": "enhanced",
         "array": None,
-        **_write(folder / ENHANCED, samples, made.sample_rate_hz, "flac"),
         "time_utc": utc_text(made.time_ns),
         "pre_roll_s": round(pre_roll_s, 4),
         "post_roll_s": round(len(signal) / made.sample_rate_hz - pre_roll_s - event.duration_s, 4),
@@ -130,6 +176,8 @@ def _write_enhanced(recipe: Recipe, folder: Path) -> dict[str, Any] | None:
         "gain_db": round(20.0 * float(np.log10(gain)), 1),
         "beams": _beams(made),
     }
+    samples = np.asarray(gain * signal[None], dtype=np.float32)
+    return Recording(ENHANCED, "flac", samples, made.sample_rate_hz, about)
 
 
 def _beams(made: Enhancement) -> Sequence[Mapping[str, Any]]:
@@ -144,16 +192,20 @@ def _beams(made: Enhancement) -> Sequence[Mapping[str, Any]]:
     ]
 
 
-def _write(path: Path, samples: Float32Array, rate_hz: float, kind: Format) -> dict[str, Any]:
-    writer = SoundWriter(path, round(rate_hz), len(samples), kind)
+def _write(recording: Recording, folder: Path) -> dict[str, Any]:
+    """Write a recording, and return its description as `ClipFile` has it."""
+    path, samples = folder / recording.name, recording.samples
+    writer = SoundWriter(path, round(recording.sample_rate_hz), len(samples), recording.format)
     try:
         writer.write(samples)
     finally:
         writer.close()
     return {
+        "name": recording.name,
+        **recording.about,
         "channels": len(samples),
-        "sample_rate_hz": round(rate_hz),
-        "duration_s": round(samples.shape[1] / rate_hz, 4),
+        "sample_rate_hz": round(recording.sample_rate_hz),
+        "duration_s": round(samples.shape[1] / recording.sample_rate_hz, 4),
         "bytes": path.stat().st_size,
     }
 

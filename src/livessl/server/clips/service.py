@@ -5,28 +5,34 @@ from __future__ import annotations
 import logging
 import os
 import threading
-from collections import deque
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Final
 
 from livessl.clock import Clock
 from livessl.core.stream.clock_offsets import ClockOffsets
 from livessl.core.types import FRAME_NS, FRAME_S, Event, Message, Status
+from livessl.schema.clips import MissingReason
 from livessl.server.api.encode import JsonObject
 from livessl.server.clips.cut import Cut, cut
 from livessl.server.clips.folder import ClipFolder
-from livessl.server.clips.record import ENHANCED, Recipe, write_clip
+from livessl.server.clips.index import Figures
+from livessl.server.clips.outcomes import Counts, Outcomes
+from livessl.server.clips.record import ENHANCED, Recipe, make_clip, write_clip
 from livessl.server.clips.ring import FrameRing
+from livessl.server.clips.speech import SpeechDetector, SpeechError
+from livessl.server.clips.trouble import Trouble
+from livessl.server.clips.waiting import Ahead, Job, WaitingEvents
 from livessl.server.overload import Overload
 from livessl.server.site_time import SiteTime
 from livessl.site.models import Site
 from livessl.site.server_models import ClipsConfig
 
 MAX_WAITING: Final = 200
-"""Most events that wait for their clips; further ones get none, and are counted."""
+"""Most events that wait for their clips; further ones get none, and are counted. Refused events take at most half of
+the places, so that they displace no others."""
 
 SETTLE_NS: Final = 1_000_000_000
 """Time, in nanoseconds, that frames after an event may take to arrive: twice the deadline of a frame index."""
@@ -50,41 +56,6 @@ STOP_S: Final = 5.0
 """Longest wait, in seconds, for the thread when the server stops."""
 
 _log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, slots=True)
-class _Ahead:
-    """The time by which an array's clock is ahead, and the whole frames of it by which the fusion corrects indices."""
-
-    ns: int
-    frames: int
-
-
-@dataclass(frozen=True, slots=True)
-class _Job:
-    """An event that waits for its clip until a monotonic time, and how far each array's clock is ahead."""
-
-    event: Event
-    due_ns: int
-    ahead: dict[str, _Ahead]
-
-
-@dataclass(slots=True)
-class Counts:
-    """Counts since the server started."""
-
-    written: int = 0
-    """Clips that were written."""
-    incomplete: int = 0
-    """Written clips in which frames of the event are missing for at least one array."""
-    without_sound: int = 0
-    """Events of which no frame was left when the clip was cut."""
-    shed: int = 0
-    """Events without a clip because too many waited, or the server was overloaded."""
-    failed: int = 0
-    """Events without a clip because of an error."""
-    deleted: int = 0
-    """Clips that were deleted because of age or lack of space."""
 
 
 class Clips:
@@ -117,14 +88,13 @@ class Clips:
         self._overload = overload
         self.folder = ClipFolder(site.file(config.folder))
         """The clips that are stored."""
+        self._outcomes = Outcomes(site.file(config.folder))
+        self._speech = SpeechDetector() if site.privacy == "no-speech" else None
         self._ring = FrameRing()
         self._spare_ns = SPARE_NS + round(1e9 * (site.fusion.max_event_s + config.pre_s + config.post_s))
         self._specs = {spec.name: spec for spec in site.processed}
-        self._lock = threading.Lock()
-        self._waiting: deque[_Job] = deque()
-        self.counts = Counts()
-        """Outcomes of the events since the server started."""
-        self._trouble: str | None = None
+        self._waiting = WaitingEvents()
+        self._trouble = Trouble()
         self._expired_ns: int | None = None
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
@@ -155,21 +125,32 @@ class Clips:
             self._ring.take(messages, None if settled is None else settled * FRAME_NS - self._spare_ns)
 
     def take_final(self, event: Event, clock_offsets: ClockOffsets) -> None:
-        """Take in a final event; only one with a position gets a clip."""
-        estimate = event.estimate
-        if self._site_time.is_replay or event.status is not Status.LOCATED or estimate is None:
+        """Take in a final event; it gets a clip if `server.clips.of` has its status, and an array has sound of it."""
+        if self._site_time.is_replay or event.status not in self._config.of:
             return
-        if self.waiting >= MAX_WAITING:
-            self.counts.shed += 1
+        if _arrays_of(event).isdisjoint(self._specs):
+            self._outcomes.left_out(event, MissingReason.WITHOUT_SOUND)
             return
-        names = [name for name in self._specs if name in event.heard_by or name in estimate.arrays]
-        ahead = {name: _ahead(clock_offsets, name) for name in names}
+        if not self._has_room(event):
+            self._outcomes.left_out(event, MissingReason.SHED)
+            return
+        ahead = {name: Ahead.of(clock_offsets, name) for name in self._specs}
         longest_ns = round(1e9 * self._config.post_s) + SETTLE_NS
         wait_ns = min(max(event.end_ns + longest_ns - self._clock.now_ns(), 0), longest_ns)
-        with self._lock:
-            self._waiting.append(_Job(event, self._clock.monotonic_ns() + wait_ns, ahead))
+        self._waiting.put(Job(event, self._clock.monotonic_ns() + wait_ns, ahead))
+
+    def _has_room(self, event: Event) -> bool:
+        """Return whether an event may wait: refused ones leave half of the places to others, and come last."""
+        if event.status is Status.REFUSED:
+            return self.waiting < MAX_WAITING // 2 and not self._overload.relief.shed
+        return self.waiting < MAX_WAITING
 
     # --- for the API
+
+    @property
+    def counts(self) -> Counts:
+        """Outcomes of the events since the server started."""
+        return self._outcomes.counts
 
     @property
     def waiting(self) -> int:
@@ -181,11 +162,25 @@ class Clips:
         """Frames that no clip can have, because the memory for frames was full."""
         return self._ring.dropped
 
+    def why_missing(self, event_id: str, status: str | None) -> MissingReason | None:
+        """Return why an event without a clip has none; None if that is not known.
+
+        Parameters
+        ----------
+        event_id : str
+        status : str or None
+            Its status; None if the event is not known.
+        """
+        known = self._outcomes.missing.why(event_id)
+        if known is None and status is not None and status not in self._config.of:
+            return MissingReason.STATUS
+        return known
+
     @property
     def problems(self) -> list[str]:
         """Sentences for the reasons of `health`."""
-        found = [] if self._trouble is None else [self._trouble]
-        kept, most = self.folder.kept_bytes, self._config.max_bytes
+        found = self._trouble.texts
+        kept, most = self.folder.figures.kept_bytes, self._config.max_bytes
         if kept > most:
             found.append(
                 "server.clips.max_bytes: clips that are kept for ever, or may be as they are unreadable, take "
@@ -195,8 +190,7 @@ class Clips:
 
     def is_waiting(self, event_id: str) -> bool:
         """Return whether an event waits for its clip."""
-        with self._lock:
-            return any(job.event.id == event_id for job in self._waiting)
+        return event_id in self._waiting
 
     # --- the thread
 
@@ -222,6 +216,8 @@ class Clips:
     def stop(self) -> None:
         """Stop; events that wait get no clip."""
         self._stop.set()
+        if self._speech is not None:
+            self._speech.close()
         if self._thread is not None:
             self._thread.join(timeout=STOP_S)
 
@@ -230,6 +226,7 @@ class Clips:
             with suppress(OSError):  # a system that does not know priorities of threads
                 os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)
             self.folder.load()
+            self._trouble.report_of("it is not known why earlier events have no clip", self._outcomes.missing.load)
             while not self._stop.is_set():
                 if not self.work():
                     self._stop.wait(POLL_S)
@@ -241,50 +238,49 @@ class Clips:
     def work(self) -> bool:
         """Delete what is old, and write the clip of one event; return whether there was one. The thread calls it."""
         self._expire()
-        with self._lock:
-            job = self._waiting[0] if self._waiting else None
-        if job is None or job.due_ns > self._clock.monotonic_ns():
+        self._trouble.report_of("it is not stored why events have no clip", self._outcomes.missing.save)
+        job = self._waiting.due(self._clock.monotonic_ns())
+        if job is None:
             return False
         if self._overload.relief.arrays is None:
             self._write(job)
         else:
-            self.counts.shed += 1
-        with self._lock:
-            self._waiting.popleft()  # only now: until then the event counts as waiting
+            self._outcomes.left_out(job.event, MissingReason.SHED)
+        self._waiting.done()
         return True
 
-    def _write(self, job: _Job) -> None:
+    def _write(self, job: Job) -> None:
         event = job.event
         try:
             cuts = self._cuts(job)
             if not cuts:
-                self.counts.without_sound += 1
+                self._outcomes.left_out(event, MissingReason.WITHOUT_SOUND)
                 return
-            recipe = Recipe(event, tuple(cuts), self._config.enhanced, self._site.c_m_s)
-            self.folder.put(event.id, lambda partial: write_clip(recipe, partial))
-        except OSError as error:
-            self.counts.failed += 1
-            self._report(f"the clip of {event.id!r} was not stored: {error.strerror or error}; free some space")
-            return
+            made = make_clip(Recipe(event, tuple(cuts), self._config.enhanced, self._site.c_m_s))
+            sounds = ((one.samples, one.sample_rate_hz) for one in made.recordings)
+            if self._speech is not None and self._speech.has_speech(sounds):
+                self._outcomes.left_out(event, MissingReason.SPEECH)
+                return
+            self.folder.put(event.id, lambda partial: write_clip(made, partial))
         except Exception as error:  # noqa: BLE001 - whatever one event has about it, the next one gets its clip
-            self.counts.failed += 1
-            _log.debug("the clip of %r failed", event.id, exc_info=error)
-            self._report(
-                f"the clip of {event.id!r} was not made: {type(error).__name__}: {error}; report this as a bug, and "
-                "set the clips' enhanced to false if it occurs again"
-            )
+            if not self._stop.is_set():
+                self._outcomes.left_out(event, MissingReason.FAILED)
+                self._trouble.report(_failure(event, error))
             return
-        self.counts.written += 1
-        self.counts.incomplete += any(lacks(each, event) for each in cuts)
-        self._trouble = self._expired_ns = None  # there may be too many bytes now
+        self._outcomes.written(is_complete=not any(lacks(each, event) for each in cuts))
+        self._trouble.clear()
+        self._expired_ns = None  # there may be too many bytes now
 
-    def _cuts(self, job: _Job) -> list[Cut]:
+    def _cuts(self, job: Job) -> list[Cut]:
         begin_ns = job.event.start_ns - round(1e9 * self._config.pre_s)
         end_ns = job.event.end_ns + round(1e9 * self._config.post_s)
-        found = (
-            cut(self._specs[name], self._ring.between(name, begin_ns + at.ns, end_ns + at.ns), at.ns, at.frames)
-            for name, at in job.ahead.items()
-        )
+        found, own = [], _arrays_of(job.event)
+        for name, at in job.ahead.items():
+            if name in self._specs and (name in own or job.event.status is Status.REFUSED):
+                frames = self._ring.between(name, begin_ns + at.ns, end_ns + at.ns)
+                # frames that were requested for a refused event are a part of why it was refused
+                if name in own or any(frame.requested for frame in frames):
+                    found.append(cut(self._specs[name], frames, at.ns, at.frames))
         return [each for each in found if each is not None]
 
     def _expire(self) -> None:
@@ -295,25 +291,34 @@ class Clips:
         limits = (self._config.max_age_days, self._site.store.retention_days)
         days = min((limit for limit in limits if limit is not None), default=None)
         before_ns = None if days is None else self._clock.now_ns() - round(days * DAY_NS)
-        try:
-            self.folder.erase_left()
-        except OSError as error:
-            self._report(f"deleted clips were not erased: {error.strerror or error}; correct that")
-        try:
-            self.counts.deleted += self.folder.expire(before_ns, self._config.max_bytes)
-        except OSError as error:
-            self._report(f"old clips were not deleted: {error.strerror or error}; correct that")
+        attempts: tuple[tuple[str, Callable[[], None]], ...] = (
+            ("deleted clips were not erased", self.folder.erase_left),
+            ("it is still noted why old events have no clip", lambda: self._outcomes.missing.expire(before_ns)),
+            ("old clips were not deleted", lambda: self._delete_old(before_ns)),
+        )
+        for what, act in attempts:
+            self._trouble.report_of(what, act)
 
-    def _report(self, what: str) -> None:
-        text = f"server.clips.folder: {what}"
-        if self._trouble is None:
-            _log.error("%s", text)
-        self._trouble = text
+    def _delete_old(self, before_ns: int | None) -> None:
+        self._outcomes.deleted(self.folder.expire(before_ns, self._config.max_bytes))
 
 
-def _ahead(clock_offsets: ClockOffsets, array: str) -> _Ahead:
-    frames = clock_offsets.frames_ahead(array)
-    return _Ahead(round(1e9 * (frames * FRAME_S + clock_offsets.rest_s(array))), frames)
+def _arrays_of(event: Event) -> set[str]:
+    """Return the arrays that detected an event, and those that it was located by."""
+    return {*event.heard_by, *(() if event.estimate is None else event.estimate.arrays)}
+
+
+def _failure(event: Event, error: Exception) -> str:
+    """Return a sentence about an error that has prevented a clip."""
+    if isinstance(error, OSError):
+        return f"the clip of {event.id!r} was not stored: {error.strerror or error}; free some space"
+    if isinstance(error, SpeechError):
+        return f"the clip of {event.id!r} was not stored, for it may contain speech: {error}"
+    _log.debug("the clip of %r failed", event.id, exc_info=error)
+    return (
+        f"the clip of {event.id!r} was not made: {type(error).__name__}: {error}; report this as a bug, and set the "
+        "clips' enhanced to false if it occurs again"
+    )
 
 
 def lacks(each: Cut, event: Event) -> bool:
@@ -326,13 +331,13 @@ def lacks(each: Cut, event: Event) -> bool:
 def state_of(clips: Clips | None) -> JsonObject:
     """Return the figures of a server's clips as the API reports them."""
     counts = Counts() if clips is None else clips.counts
-    folder = None if clips is None else clips.folder
+    figures = Figures() if clips is None else clips.folder.figures
     return {
         "enabled": clips is not None,
-        "clips": 0 if folder is None else folder.count,
-        "bytes": 0 if folder is None else folder.nbytes,
-        "kept": 0 if folder is None else folder.kept,
-        "unreadable": 0 if folder is None else folder.unreadable,
+        "clips": figures.count,
+        "bytes": figures.nbytes,
+        "kept": figures.kept,
+        "unreadable": figures.unreadable,
         "waiting": 0 if clips is None else clips.waiting,
         "frames_dropped": 0 if clips is None else clips.frames_dropped,
         **asdict(counts),

@@ -24,6 +24,7 @@ export class Clips {
   show(event, details) {
     const section = el("section", { className: "clips", "data-testid": "clips", "aria-label": "Recordings" });
     details.append(section);
+    section.dataset.status = event.status;
     this.#load(event.id, section, ATTEMPTS);
   }
 
@@ -40,6 +41,7 @@ export class Clips {
     if (found?.state === "stored") this.#fill(found, section);
     else if (found?.state === "waiting") section.replaceChildren(el("p", { className: "clip-note", text: "Recordings are being made…" }));
     else if (found?.state === "unreadable") this.#explain(found, section);
+    else if (found?.problem) this.#sayNone(found, section);
     else section.replaceChildren();
     const again = found === null || found.state === "waiting";
     if (again && attempts > 1) setTimeout(() => section.isConnected && this.#load(id, section, attempts - 1), RETRY_MS);
@@ -49,7 +51,8 @@ export class Clips {
     const { event_id: id, files } = found;
     section.replaceChildren(
       el("h3", { text: "Recordings" }),
-      el("ul", {}, ...files.map((file) => this.#item(id, file))),
+      el("ul", {}, ...files.map((file) => this.#item(id, file, section.dataset.status))),
+      found.no_enhanced ? el("p", { className: "clip-note", text: `No enhanced signal: ${found.no_enhanced}.` }) : "",
       this.mayListen
         ? this.#tools(found, section)
         : el("p", { className: "clip-note", text: "Sign in as an operator to listen." }));
@@ -65,8 +68,16 @@ export class Clips {
       this.mayListen ? el("p", { className: "clip-tools" }, this.#deletion(id, section)) : "");
   }
 
-  #item(id, file) {
-    const title = file.kind === "enhanced" ? "Enhanced, at the place found" : `Array ${file.array}`;
+  /** Why there are no recordings. */
+  #sayNone({ problem }, section) {
+    section.replaceChildren(
+      el("h3", { text: "Recordings" }),
+      el("p", { className: "clip-note", "data-testid": "clip-missing", text: `There are no recordings: ${problem}.` }));
+  }
+
+  #item(id, file, status) {
+    const where = status === "direction-only" ? "in the direction found" : "at the place found";
+    const title = file.kind === "enhanced" ? `Enhanced, ${where}` : `Array ${file.array}`;
     const parts = [
       `${number(file.duration_s, 1)} s`,
       file.channels > 1 ? `${file.channels} channels` : null,

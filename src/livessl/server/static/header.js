@@ -8,6 +8,11 @@ import { shownState } from "./model.js";
 const NOTICE_MS = 20000;
 /** Time, in milliseconds, that the first connection may take before the page reports a problem. */
 const FIRST_CONTACT_MS = 1000;
+/** What a privacy mode means: on the bar, and in its tooltip. */
+const PRIVACY = {
+  "positions-only": ["positions only", "No sound is stored"],
+  "no-speech": ["no speech", "Recordings in which speech is detected are not stored, and live listening is refused"],
+};
 const LINK_WORDS = { live: "connected", stale: "stale", down: "offline" };
 
 export class Header {
@@ -30,12 +35,11 @@ export class Header {
   }
 
   showPrivacy({ mode, retention_days: days }) {
-    const positionsOnly = mode === "positions-only";
+    const [word, sound] = PRIVACY[mode] ?? [null, "Sound may be recorded"];
     const chip = find("privacy");
-    chip.hidden = !positionsOnly && days === null;
-    const words = [positionsOnly ? "positions only" : null, days === null ? null : `kept ${days} d`];
+    chip.hidden = word === null && days === null;
+    const words = [word, days === null ? null : `kept ${days} d`];
     write(chip, words.filter(Boolean).join(" · "));
-    const sound = positionsOnly ? "No sound is stored" : "Sound may be recorded";
     chip.title = `${sound}. Events are ${days === null ? "never deleted" : `deleted after ${days} days`}.`;
   }
 
