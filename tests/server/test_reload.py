@@ -184,7 +184,7 @@ def test_what_waits_is_delivered_by_the_new_action_and_armed_rules_stay_as_they_
             service = server.parts.alerts
             service.arm("off", False)
             finish(server, known)
-            wait_until(lambda: service.couriers["guard"].failed, "an attempt in vain")
+            wait_until(lambda: service.deliverers["guard"].failed, "an attempt in vain")
             write_site(tmp_path, alerts(receiver.url))
             assert list(server.parts.reloader.reload().changed) == ["alerts.actions.guard.webhook.url"]
             [delivery] = service.outbox.deliveries([key_of(known)])[key_of(known)]

@@ -1,6 +1,7 @@
-"""The frames of a node until the server needs them no more: in memory, or in files that outlive the process.
+"""Keeps the frames of a node until the server no longer needs them, in memory or in files that outlive the process.
 
-On disk, the spool is a folder of segments, which are only appended to. A segment is a magic number followed by records:
+The limits of size and age are settings: `livessl.site.node_models.SpoolConfig` has the keys and their defaults. On
+disk, the spool is a folder of segments, which are only appended to. A segment is a magic number followed by records:
 length and CRC-32 of a message, little-endian, and the message as it goes over the wire. A record that was half written
 when the node was killed ends its segment. A segment is deleted when none of its frames is needed any more.
 """

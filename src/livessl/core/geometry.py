@@ -1,4 +1,7 @@
-"""Array shapes, poses, directions and the search grid: metres, right-handed, z up, room corner at the origin."""
+"""Array shapes, poses, directions, the search grid, and the speed of sound from a temperature.
+
+Coordinates are in metres, right-handed, with z up and a corner of the room at the origin.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,7 @@ SPEED_OF_SOUND_0C_M_S: Final = 331.3
 
 
 def speed_of_sound_m_s(temperature_c: float) -> float:
-    """Speed of sound in dry air, m/s, at a temperature in degrees Celsius: 331.3 sqrt(1 + T/273.15)."""
+    """Return the speed of sound in dry air, m/s, at a temperature in degrees Celsius: 331.3 sqrt(1 + T/273.15)."""
     return SPEED_OF_SOUND_0C_M_S * float(np.sqrt(1.0 + temperature_c / 273.15))
 
 

@@ -1,4 +1,9 @@
-"""Sinks: further places that get every event. `livessl.site.sink_types.SINKS` names the type of each."""
+"""Sinks: destinations of events other than the store and the API, such as a file of JSON lines.
+
+To add a sink, write a class with the methods of `Sink` here, and add it by name to the registry
+`livessl.site.sink_types.SINKS`. The name is the `type` in the site file (`server.sinks`). The constructor gets the
+`SinkConfig` of the site file; settings other than `path` are added to that model in `livessl.site.server_models`.
+"""
 
 from __future__ import annotations
 
@@ -22,14 +27,14 @@ class SinkError(RunError):
 
 
 class Sink(Protocol):
-    """Takes events, one by one, on the fusion thread."""
+    """Receives events, one at a time, on the fusion thread."""
 
     def take(self, event: JsonObject) -> None:
         """Deliver one event."""
         ...
 
     def close(self) -> None:
-        """Deliver what is still buffered, and release what is open."""
+        """Deliver buffered events, and close files and connections."""
         ...
 
 
@@ -53,7 +58,7 @@ class JsonLines:
 
 
 class Sinks:
-    """All sinks of a site; one that fails is logged and counted, and does not hinder the others."""
+    """All sinks of a site. A failure of one sink is logged and counted, and does not affect the others."""
 
     def __init__(self, configs: Sequence[SinkConfig]) -> None:
         self._sinks = [(config.type, _opened(config)) for config in configs]

@@ -51,7 +51,11 @@ DeviceConfig = SoundDeviceConfig | WavDeviceConfig | SceneDeviceConfig
 
 
 class SpoolConfig(Model):
-    """The store of the frames that the server may still need: a folder, or by default memory."""
+    """The store of the frames that the server may still need: a folder, or by default memory.
+
+    The oldest frames are removed beyond `max_mb` megabytes or `max_age_s` seconds. In memory, a lower limit applies as
+    well: `livessl.capture.spool.MEMORY_BYTES`.
+    """
 
     directory: FileName | None = None
     max_mb: Positive = 512.0

@@ -1,4 +1,4 @@
-"""Types of sinks, by their name in the site file. Checking a site file loads this module, and no sink."""
+"""The registry of sinks by their `type` in the site file. Checking a site file imports this module, but no sink."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ from collections.abc import Callable
 from typing import Final
 
 SINKS: Final[dict[str, str | Callable[..., object]]] = {"jsonl": "livessl.server.sinks:JsonLines"}
-"""Registry of the sinks: from the `type` in a site file to the factory, which gets a `SinkConfig` and returns a
-`livessl.server.sinks.Sink`.
+"""Maps the `type` in a site file to a factory, which gets a `SinkConfig` and returns a `livessl.server.sinks.Sink`.
 
 A factory is a callable, or the text "module:attribute" of one that is imported when a server opens the sink."""
 

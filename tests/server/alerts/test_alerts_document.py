@@ -58,7 +58,7 @@ def test_documented_receiver_checks_the_secret_that_the_documented_command_makes
         (tmp_path / "hook.secret").write_text("whsec_" + "A" * 40 + "\n", encoding="utf-8")
         with running_desk(alert_site(tmp_path, actions=actions, rules={"door": RULE})) as stranger:
             stranger.finish(sound(2))
-            wait_until(lambda: stranger.alerts.couriers["guard"].failed, "the refusal")
+            wait_until(lambda: stranger.alerts.deliverers["guard"].failed, "the refusal")
             [(_, alert)] = stranger.alerts.outbox.recent(1)
             [delivery] = stranger.alerts.outbox.deliveries([alert["key"]])[alert["key"]]
     assert delivery.error == "answered 401, expected 2xx"

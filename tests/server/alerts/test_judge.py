@@ -258,7 +258,7 @@ def test_alerts_of_a_removed_action_are_dead_letters_that_can_be_dismissed(
     door = {"door": {**DOOR, "actions": ["guard"]}}
     with running_desk(alert_site(tmp_path, kept, actions=guard, rules=door)) as desk:
         desk.finish(sound(1))
-        wait_until(lambda: desk.alerts.couriers["guard"].failed, "a failed attempt")
+        wait_until(lambda: desk.alerts.deliverers["guard"].failed, "a failed attempt")
     with running_desk(alert_site(tmp_path, kept, rules=rules)) as desk:
         assert desk.alerts.counts() == {("guard", DeliveryState.DEAD): 1}
         assert desk.alerts.problems == ["alerts.actions.guard: 1 alert was given up; see GET alerts/dead-letters"]

@@ -202,7 +202,7 @@ def test_alert_waits_for_a_broker_that_is_away_and_comes_back(tmp_path: Path) ->
             wait_until(lambda: states(desk) == {"delivered": 1}, "the first delivery")
             broker.close()
             desk.finish(sound(2))
-            wait_until(lambda: desk.alerts.couriers["home"].failed, "a failed attempt")
+            wait_until(lambda: desk.alerts.deliverers["home"].failed, "a failed attempt")
             with running_mosquitto(tmp_path, port), Listener(port) as listener:
                 wait_until(lambda: states(desk) == {"delivered": 2}, "the second delivery")
                 wait_until(lambda: listener.of("livessl/small/availability")[-1:] == [b"online"], "the presence")

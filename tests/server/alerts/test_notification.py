@@ -144,7 +144,7 @@ def test_service_that_refuses_is_tried_again(tmp_path: Path) -> None:
         url = receiver.url.replace("http://", "json://")
         with running_desk(notify_site(tmp_path, url, timeout_s=60)) as desk:
             desk.finish(sound(1))
-            wait_until(lambda: desk.alerts.couriers["tell"].failed >= 2, "failed attempts")
+            wait_until(lambda: desk.alerts.deliverers["tell"].failed >= 2, "failed attempts")
             receiver.answer = lambda: (200, {})
             wait_until(lambda: states(desk) == {"delivered": 1}, "the delivery")
     assert json.loads(receiver.accepted[0].body)["title"] == "livessl small: door"

@@ -19,7 +19,7 @@ from conftest import require
 from livessl.clock import SystemClock
 from livessl.errors import ConfigError
 from livessl.lab.processes import free_port
-from livessl.server.alerts.courier import backoff_s
+from livessl.server.alerts.delivery import backoff_s
 from livessl.server.alerts.outbox import DeliveryState, OutboxError
 from livessl.site.alert_models import AlertAction
 from livessl.site.models import Site
@@ -57,7 +57,7 @@ def states(desk: Desk) -> dict[str, int]:
 def test_an_alert_that_has_arrived_is_not_sent_again_while_the_outbox_cannot_be_written(
     tmp_path: Path, receiver: Receiver, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("livessl.server.alerts.courier.REST_S", 0.01)
+    monkeypatch.setattr("livessl.server.alerts.delivery.REST_S", 0.01)
     with running_desk(hook_site(tmp_path, receiver.url)) as desk:
         refused: list[int] = []
         note = desk.alerts.outbox.delivered
@@ -130,7 +130,7 @@ def test_address_without_a_receiver_gets_the_alert_once_there_is_one(tmp_path: P
     port = free_port()
     with running_desk(hook_site(tmp_path, f"http://127.0.0.1:{port}/hook")) as desk:
         desk.finish(sound(1))
-        wait_until(lambda: desk.alerts.couriers["guard"].failed >= 2, "failed attempts")
+        wait_until(lambda: desk.alerts.deliverers["guard"].failed >= 2, "failed attempts")
         [delivery] = desk.alerts.outbox.deliveries([key_of(sound(1))])[key_of(sound(1))]
         assert delivery.error is not None
         assert delivery.error.startswith(f"cannot reach 127.0.0.1:{port}: ")
@@ -174,7 +174,7 @@ def test_wait_that_the_receiver_asks_for_is_kept(tmp_path: Path, receiver: Recei
     clock = SystemClock()
     with running_desk(hook_site(tmp_path, receiver.url, longest_wait_s=60)) as desk:
         desk.finish(sound(1))
-        wait_until(lambda: desk.alerts.couriers["guard"].failed, "an attempt")
+        wait_until(lambda: desk.alerts.deliverers["guard"].failed, "an attempt")
         wait_until(lambda: (desk.alerts.outbox.next_due_ns("guard") or 0) > clock.now_ns(), "the next time")
         assert (desk.alerts.outbox.next_due_ns("guard") or 0) > clock.now_ns() + 20 * 10**9
         assert len(receiver.requests) == 1

@@ -1,6 +1,7 @@
 """Finds faults of single channels in their samples, with or without sounds: clipping, a constant, hum, noise.
 
-`findings` finds dead, deaf, copied and inverted channels by the sounds that arrays received.
+`findings` finds dead, deaf, copied and inverted channels by the sounds that arrays received. Swapped channels are
+tried in `hypotheses`, compared in `judge` (in `trial` for sounds at known places), and chosen in `diagnosis`.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """Activity detection on 50 ms frames: the paper's rule, exact over a finished event and causal for live use.
 
-The rule (Garcia-Barrios et al., section on the sound activity detector): a frame is active where its mean power is at
+The rule (Garcia-Barrios et al., section on the sound activity detector): a frame is active if its mean power is at
 least a tenth of the reference power. Over a finished event the reference is the event's maximum. Live it is a decaying
-maximum, with a lower limit of which the background stays below a tenth.
+maximum with a lower limit, and the noise floor stays below a tenth of that limit. `CausalActivity` measures the noise
+floor of an array: the smallest smoothed power of the last seconds.
 """
 
 from __future__ import annotations
@@ -51,9 +52,9 @@ class ActivityParameters:
         Time constant of the decaying maximum. 1 s is 4 dB a second: slower than any room's decay, so that
         reverberation ends a sound instead of becoming one.
     floor_window_s : float
-        Length of the window whose least smoothed power is the background.
+        Length of the window whose smallest smoothed power is the noise floor.
     floor_factor : float
-        Least ratio of an active frame's power to the background.
+        Least ratio of an active frame's power to the noise floor.
     min_power : float
         Least power of an active frame, full scale squared.
     pre_roll_s, hang_over_s : float
@@ -84,7 +85,7 @@ class ActivityParameters:
         return float(np.exp(-FRAME_S / self.release_s))
 
     def least_power(self, floor_power: float) -> float:
-        """Return the least power, full scale squared, at which a frame can be active over a background."""
+        """Return the least power of an active frame above a noise floor, both in full scale squared."""
         return max(self.floor_factor * floor_power, self.min_power)
 
 
@@ -97,23 +98,23 @@ class CausalActivity:
         self._maximum = 0.0
         self._latest: deque[float] = deque(maxlen=_FLOOR_SMOOTHING)
         self._smoothed: deque[float] = deque(maxlen=max(1, round(parameters.floor_window_s / FRAME_S)))
-        self._floor_power = 0.0  # the least of them
+        self._floor_power = 0.0  # the smallest of `_smoothed`
 
     @property
     def floor_power(self) -> float:
-        """The background, full scale squared; 0 before the first frame."""
+        """The noise floor, full scale squared; 0 before the first frame."""
         return self._floor_power
 
     def prime(self, floor_power: float) -> None:
-        """Start from a known background, full scale squared, as though it had lasted until now."""
+        """Start from a known noise floor, full scale squared, as if it had lasted until now."""
         self._latest.extend([floor_power] * _FLOOR_SMOOTHING)
         self._smoothed.append(floor_power)
         self._floor_power = min(self._smoothed)
 
     def restart(self, floor_power: float, maximum: float) -> None:
-        """Start over, because part of the power is no longer counted, from a background and a decaying maximum.
+        """Start over, because part of the power is no longer counted.
 
-        Both are what is left of them, full scale squared.
+        `floor_power` is the noise floor and `maximum` the decaying maximum without that part, full scale squared.
         """
         self._maximum = min(self._maximum, maximum)
         self._latest.clear()

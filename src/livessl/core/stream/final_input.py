@@ -1,7 +1,9 @@
-"""The sound of all arrays as it comes for the final pass: what has come, and up to which frame index that is complete.
+"""Collects the frames of all arrays, late ones included, for the final pass, and finds up to where they are complete.
 
-Frame indices of single arrays are those of their own clocks. Joint ones are smaller by the frames that the array is
-ahead; the final pass learns that number from its events, and so it is asked for.
+A frame that was late for early results is still part of the final result. A frame that comes after the results of its
+time are final is dropped and counted as `too_late`. Frame indices of single arrays follow the clocks of those arrays.
+A joint frame index is smaller by the number of frames by which the array's clock is ahead; the final pass estimates
+this number from its events.
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ from livessl.core.types import FRAME_NS, Event, Mark, Message
 
 
 class FinalInput:
-    """Frames that have come for the final pass, and the frame indices before which no more will come.
+    """Frames that have arrived for the final pass, and the frame indices before which no more will arrive.
 
     Parameters
     ----------
@@ -45,11 +47,11 @@ class FinalInput:
         self._limits = hold_ns, hold_bytes
         self._receptions = {name: FinalReception() for name in arrays}
         self.duplicates = dict.fromkeys(self._receptions, 0)
-        """Number of frames of each array that had come before."""
+        """Number of frames of each array that had already arrived before."""
         self.backlog_frames = dict.fromkeys(self._receptions, 0)
-        """Number of frames of each array that came as backlog."""
+        """Number of frames of each array that arrived as backlog."""
         self.too_late = dict.fromkeys(self._receptions, 0)
-        """Number of new frames of each array that came after the results of their time were final."""
+        """Number of new frames of each array that arrived after the results of their time were final."""
         self.thinned = Counter[str]()
         """Number of frames of each array whose samples were dropped, because too many frames were held."""
         self.start_over()
@@ -57,8 +59,8 @@ class FinalInput:
     def start_over(self) -> None:
         """Forget all frames, because the server's clock was set back; the counts remain."""
         self.held = HeldFrames(*self._limits)
-        """Frames that the final pass has not taken yet."""
-        self._newest: int | None = None  # the newest frame index that has come of any array
+        """Frames that the final pass has not processed yet."""
+        self._newest: int | None = None  # the newest frame index that has arrived from any array
         self._late: set[int] = set()  # active frame indices that the early pass could not use in time
         self._forgotten_before: int | None = None
         for reception in self._receptions.values():
@@ -114,8 +116,8 @@ class FinalInput:
     def complete_until(self, now_ns: int, position: int | None) -> int | None:
         """Return the frame index up to which all awaited arrays have sent everything; None if one has sent nothing.
 
-        Arrays that are away are awaited until the frames of the others are overdue. `position` is the frame index up to
-        which the final pass has gone.
+        An array that is not connected is awaited until the frames of the others are overdue. `position` is the frame
+        index up to which the final pass has processed frames.
         """
         self.thinned.update(self.held.expire(now_ns, position, shedding=self._state.relief.arrays is not None))
         connected: list[int | None] = []
@@ -139,7 +141,7 @@ class FinalInput:
         return any(event.start_ns <= frame_index * FRAME_NS < event.end_ns for frame_index in self._late)
 
     def forget(self, settled: int) -> None:
-        """Forget what has come before the frame index before which all results are final."""
+        """Forget the frames before `settled`, the joint frame index before which all results are final."""
         if settled == self._forgotten_before:
             return
         self._forgotten_before = settled

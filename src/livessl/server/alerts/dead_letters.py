@@ -20,14 +20,14 @@ class DeadLetters:
     in_force : callable
         Returns the rules and actions that are in force, with their outbox.
     clock : Clock
-    wake_couriers : callable
-        Has the couriers look for new deliveries.
+    wake_deliverers : callable
+        Has the deliverers look for new deliveries.
     """
 
-    def __init__(self, in_force: Callable[[], AlertsInForce], clock: Clock, wake_couriers: Callable[[], None]) -> None:
+    def __init__(self, in_force: Callable[[], AlertsInForce], clock: Clock, wake_deliverers: Callable[[], None]) -> None:
         self._in_force = in_force
         self._clock = clock
-        self._wake_couriers = wake_couriers
+        self._wake_deliverers = wake_deliverers
 
     def page(self, limit: int, before: int | None = None) -> Sequence[tuple[Delivery, JsonObject]]:
         """Return dead letters with their alerts, newest first; those before a number, if one is given."""
@@ -49,10 +49,10 @@ class DeadLetters:
         action = in_force.outbox.action_of_dead(number)
         if action is None:
             raise LookupError(f"no dead letter {number}; GET alerts/dead-letters lists them")
-        if action not in in_force.couriers:
+        if action not in in_force.deliverers:
             cure = "add it to alerts.actions, or dismiss the dead letter with DELETE"
             raise LookupError(
                 f"dead letter {number} is for action {action!r}, which the site file does not have; {cure}"
             )
         in_force.outbox.resend(number, self._clock.now_ns())
-        self._wake_couriers()
+        self._wake_deliverers()

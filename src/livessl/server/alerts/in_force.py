@@ -10,7 +10,7 @@ from pathlib import Path
 
 from livessl.clock import Clock
 from livessl.server.alerts.actions import ActionSetting, make_action
-from livessl.server.alerts.courier import Courier
+from livessl.server.alerts.delivery import Deliverer
 from livessl.server.alerts.evidence import Evidence
 from livessl.server.alerts.history import DryRuns
 from livessl.server.alerts.judge import Judge
@@ -57,7 +57,7 @@ class Surroundings:
 
 
 class AlertsInForce:
-    """Rules with their states, and a courier for each action.
+    """Rules with their states, and a deliverer for each action.
 
     Parameters
     ----------
@@ -84,15 +84,15 @@ class AlertsInForce:
         self.judges_tracks = "tracks" in kinds
         self.judges_conditions = not kinds.isdisjoint(("arrays", "findings"))
         base = self.config.url or around.url + site.server.http.root_path
-        self.couriers = {name: _courier(name, site, around, outbox, base) for name in self.config.actions}
-        """The courier of each action, by name."""
+        self.deliverers = {name: _deliverer(name, site, around, outbox, base) for name in self.config.actions}
+        """The deliverer of each action, by name."""
         self.dry_runs = DryRuns(self.config, around.store, around.zones)
         """Tries rules on the history."""
         self.judge = Judge(site, around.clock, outbox, AlertMessages(site, base), around.zones)
         """The rules with their states."""
         if not self.judges_events:  # rules that come back must not judge the time between
             outbox.forget_judged(site.site)
-        if gone := outbox.abandon(self.couriers):
+        if gone := outbox.abandon(self.deliverers):
             _log.warning("%d alerts waited for actions that the site file no longer has; they are dead letters", gone)
 
 
@@ -102,7 +102,7 @@ def outbox_path(site: Site) -> Path | None:
     return path if path is not None and (site.alerts.rules or path.exists()) else None
 
 
-def _courier(name: str, site: Site, around: Surroundings, outbox: Outbox, url: str) -> Courier:
+def _deliverer(name: str, site: Site, around: Surroundings, outbox: Outbox, url: str) -> Deliverer:
     alerts, config = site.alerts, site.alerts.actions[name]
     rules = [rule for rule, each in alerts.rules.items() if name in each.actions]
     alike = {other for other, each in alerts.actions.items() if each.kind == config.kind}
@@ -111,4 +111,4 @@ def _courier(name: str, site: Site, around: Surroundings, outbox: Outbox, url: s
     action = make_action(ActionSetting(name, config, site, around.clock, rules, others, url, around.evidence))
     links = around.links
     complete = None if links is None else partial(with_links, links=links, config=alerts.links, url=url)
-    return Courier(name, config, action, outbox, around.clock, around.traces, complete)
+    return Deliverer(name, config, action, outbox, around.clock, around.traces, complete)

@@ -1,8 +1,8 @@
 """The outbox: alerts, their deliveries and the rules' states, in SQLite, so that none is lost in a restart.
 
-What a batch of events raises is written in one transaction with how far the events are judged. A server that is killed
-judges the others again, and the keys of alerts prevent a second entry. `courier` delivers what is in it, and says when
-to try again.
+The alerts of a batch of events are written in one transaction, together with the time up to which events have been
+judged. After a crash, later events are judged again, and the keys of alerts prevent a second entry. `delivery` sends
+the stored alerts, and sets the time of the next attempt.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from livessl.server.alerts.courier import NS_PER_S
+from livessl.server.alerts.delivery import NS_PER_S
 from livessl.server.alerts.outbox import Outbox
 
 EXPIRE_NS: Final = 600 * NS_PER_S

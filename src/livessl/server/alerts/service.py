@@ -1,6 +1,6 @@
-"""The alerts of a running server: its rules judge events and conditions, and couriers deliver what they raise.
+"""The alerts of a running server: its rules judge events and conditions, and its deliverers send the alerts.
 
-The fusion thread only appends to a bounded queue. What does not fit there is judged from the event store instead.
+The fusion thread only appends to a bounded queue. Events that find no room there are read from the event store later.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from typing import Final
 
 from livessl.core.types import FRAME_NS
 from livessl.errors import RunError
-from livessl.server.alerts.courier import Courier
 from livessl.server.alerts.dead_letters import DeadLetters
+from livessl.server.alerts.delivery import Deliverer
 from livessl.server.alerts.event_order import EventOrder
 from livessl.server.alerts.evidence import Evidence
 from livessl.server.alerts.history import DryRuns
@@ -107,8 +107,8 @@ class Alerts:
         self._is_failing = False
         self._starting = threading.RLock()
         self._changing = threading.Lock()  # a rule is armed either before or after it is replaced
-        self._thread = AlertThread(self._turn, lambda: self.couriers.values())
-        self.dead_letters = DeadLetters(lambda: self._in_force, around.clock, self._thread.wake_couriers)
+        self._thread = AlertThread(self._turn, lambda: self.deliverers.values())
+        self.dead_letters = DeadLetters(lambda: self._in_force, around.clock, self._thread.wake_deliverers)
         """Deliveries that were given up."""
 
     # --- for the fusion thread
@@ -169,9 +169,9 @@ class Alerts:
         return self._in_force.dry_runs
 
     @property
-    def couriers(self) -> Mapping[str, Courier]:
-        """The courier of each action that is in force, by name."""
-        return self._in_force.couriers
+    def deliverers(self) -> Mapping[str, Deliverer]:
+        """The deliverer of each action that is in force, by name."""
+        return self._in_force.deliverers
 
     @property
     def problems(self) -> list[str]:
@@ -293,4 +293,4 @@ class Alerts:
             _log.info("alert of rule %r: %s", alert["rule"], alert["text"])
             self._publish(alert)
         if alerts:
-            self._thread.wake_couriers()
+            self._thread.wake_deliverers()

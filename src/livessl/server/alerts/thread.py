@@ -1,4 +1,4 @@
-"""The thread of the alerts: takes turns at judging, and runs the couriers meanwhile. It knows no rules."""
+"""The thread of the alerts: takes turns at judging, and runs the deliverers meanwhile. It knows no rules."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 from typing import Final
 
-from livessl.server.alerts.courier import REST_S, Courier
+from livessl.server.alerts.delivery import REST_S, Deliverer
 
 POLL_S: Final = 0.5
 """Longest wait, in seconds, between two turns: arrays and findings are looked at as often."""
@@ -51,13 +51,13 @@ class AlertThread:
     ----------
     turn : callable
         Judges what waits; returns False if it failed and is to rest before the next turn. The thread calls it.
-    couriers : callable
-        Returns the couriers of the actions that are in force.
+    deliverers : callable
+        Returns the deliverers of the actions that are in force.
     """
 
-    def __init__(self, turn: Callable[[], bool], couriers: Callable[[], Iterable[Courier]]) -> None:
+    def __init__(self, turn: Callable[[], bool], deliverers: Callable[[], Iterable[Deliverer]]) -> None:
         self._turn = turn
-        self._couriers = couriers
+        self._deliverers = deliverers
         self._news, self._end, self._replaced = asyncio.Event(), asyncio.Event(), asyncio.Event()
         self._loop: asyncio.AbstractEventLoop | None = None
         self._thread: threading.Thread | None = None
@@ -85,13 +85,13 @@ class AlertThread:
         """Take a turn soon."""
         self._call(self._news.set)
 
-    def wake_couriers(self) -> None:
-        """Have the couriers look for new deliveries."""
-        for courier in self._couriers():
-            self._call(courier.wake)
+    def wake_deliverers(self) -> None:
+        """Have the deliverers look for new deliveries."""
+        for deliverer in self._deliverers():
+            self._call(deliverer.wake)
 
     def exchange(self, work: Callable[[], None], longest_s: float) -> None:
-        """Do `work` between two turns, then run the couriers that are in force after it.
+        """Do `work` between two turns, then run the deliverers that are in force after it.
 
         Raises
         ------
@@ -141,18 +141,18 @@ class AlertThread:
             task.result()  # raises the error that ended it, if there was one
 
     async def _deliver_all(self) -> None:
-        """Run the couriers of the actions that are in force, until cancelled."""
+        """Run the deliverers of the actions that are in force, until cancelled."""
         while True:
             self._replaced.clear()
             replaced = asyncio.create_task(self._replaced.wait())
-            couriers = [asyncio.create_task(courier.run()) for courier in self._couriers()]
+            deliverers = [asyncio.create_task(deliverer.run()) for deliverer in self._deliverers()]
             try:
-                await asyncio.wait([*couriers, replaced], return_when=asyncio.FIRST_COMPLETED)
+                await asyncio.wait([*deliverers, replaced], return_when=asyncio.FIRST_COMPLETED)
             finally:
-                for task in (*couriers, replaced):
+                for task in (*deliverers, replaced):
                     task.cancel()
-                await asyncio.gather(*couriers, replaced, return_exceptions=True)
-            for task in couriers:
+                await asyncio.gather(*deliverers, replaced, return_exceptions=True)
+            for task in deliverers:
                 if not task.cancelled():
                     task.result()  # raises the error that ended it
 

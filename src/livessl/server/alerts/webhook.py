@@ -1,4 +1,4 @@
-"""Webhooks: alerts as HTTP requests, signed by the Standard Webhooks specification. `courier` repeats failed ones."""
+"""Webhooks: alerts as HTTP requests, signed as Standard Webhooks specifies. `delivery` sends failed ones again."""
 
 from __future__ import annotations
 

@@ -31,9 +31,9 @@ def alert_metrics(parts: Parts) -> Iterator[Metric]:
     waiting = GaugeMetricFamily("livessl_alert_waiting", "Alerts that wait to be delivered.", labels=["action"])
     dead = GaugeMetricFamily("livessl_alert_dead_letters", "Alerts that were given up.", labels=["action"])
     counts = alerts.counts()
-    for name, courier in alerts.couriers.items():
-        attempts.add_metric([name, "delivered"], courier.delivered)
-        attempts.add_metric([name, "failed"], courier.failed)
+    for name, deliverer in alerts.deliverers.items():
+        attempts.add_metric([name, "delivered"], deliverer.delivered)
+        attempts.add_metric([name, "failed"], deliverer.failed)
         waiting.add_metric([name], counts.get((name, DeliveryState.WAITING), 0))
         dead.add_metric([name], counts.get((name, DeliveryState.DEAD), 0))
     yield from (raised, suppressed, armed, attempts, waiting, dead)

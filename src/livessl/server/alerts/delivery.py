@@ -1,4 +1,8 @@
-"""A courier takes the alerts of one action out of the outbox, and tries again until they are delivered or hopeless."""
+"""Delivers alerts, and sends an alert again after a failure until it is delivered or given up.
+
+Each action has one `Deliverer`, which takes its alerts out of the outbox. The defaults of attempts and waits are in
+`livessl.site.alert_models.AlertAction`.
+"""
 
 from __future__ import annotations
 
@@ -22,16 +26,16 @@ REST_S: Final = 1.0
 """Wait, in seconds, after the outbox could not be read or written."""
 
 LOOK_S: Final = 30.0
-"""Longest wait, in seconds, before the outbox is looked at again although nothing is due: clocks can be set."""
+"""Longest wait, in seconds, before the outbox is read again although nothing is due, because clocks can be set."""
 
 JITTER: Final = 0.1
-"""Largest share by which a wait is lengthened, so that alerts of one moment do not return in one moment."""
+"""Largest share by which a wait is lengthened, so that alerts that failed together are not all sent again together."""
 
 _log = logging.getLogger(__name__)
 
 
-class Courier:
-    """Delivers what waits for one action, one alert at a time, the one that is due first.
+class Deliverer:
+    """Delivers the alerts that wait for one action, one at a time, in the order in which they are due.
 
     Parameters
     ----------
@@ -44,7 +48,7 @@ class Courier:
     traces : EventTraces or None
         Adds a span for each attempt; None if nothing is traced.
     complete : callable or None
-        Returns an alert with what each attempt adds to it, such as links; None adds nothing.
+        Returns an alert together with the fields that are made for each attempt, such as links; None adds nothing.
     """
 
     def __init__(
@@ -72,7 +76,7 @@ class Courier:
         """Attempts that failed since the start."""
 
     def wake(self) -> None:
-        """Look at the outbox again; on the event loop's thread."""
+        """Read the outbox again at once. Call it on the event loop's thread."""
         self._news.set()
 
     async def run(self) -> None:
@@ -103,7 +107,7 @@ class Courier:
     def _reachable(self) -> None:
         try:
             self._outbox.hasten(self.name, self._clock.now_ns())
-        except OutboxError as error:  # it is delivered at the time that was set before
+        except OutboxError as error:  # the alerts are delivered at the times that were set before
             _log.error("%s", error)
         self.wake()
 
@@ -114,13 +118,13 @@ class Courier:
         return min(LOOK_S, max(0.0, (next_ns - self._clock.now_ns()) / NS_PER_S))
 
     def _note_outcome(self) -> None:
-        """Note what has become of the last attempt, before there is another: it must not be made again in vain."""
+        """Write the outcome of the last attempt to the outbox before the next one, so that no attempt is repeated."""
         if self._outcome is not None:
             self._outcome()
             self._outcome = None
 
     async def _deliver(self, alert: JsonObject) -> None:
-        """Deliver an alert, with a span of it if the process is traced."""
+        """Deliver an alert, and record the attempt as a span if the process is traced."""
         if self._traces is None:
             await self._attempted(alert)
             return
@@ -134,7 +138,7 @@ class Courier:
             self._traces.delivered(alert, self.name, began_ns, self._clock.now_ns(), fault)
 
     async def _attempted(self, alert: JsonObject) -> None:
-        """Deliver an alert; an unexpected fault of the action is a failed attempt like any other."""
+        """Deliver an alert; an unexpected error of the action counts as a failed attempt."""
         try:
             await self._action.deliver(alert if self._complete is None else self._complete(alert))
         except DeliveryError:
@@ -144,7 +148,7 @@ class Courier:
             raise DeliveryError(f"{type(error).__name__}: {error}") from error
 
     async def _attempt(self, due: Due) -> Callable[[], None]:
-        """Try to deliver an alert; return what notes the outcome in the outbox."""
+        """Try to deliver an alert; return a function that writes the outcome to the outbox."""
         key, rule = due.alert["key"], due.alert["rule"]
         try:
             await self._deliver(due.alert)
@@ -168,7 +172,10 @@ class Courier:
 
 
 def backoff_s(config: AlertAction, attempts: int, key: str) -> float:
-    """Return the wait after so many failed attempts, in seconds: doubled each time, and a little longer by the key."""
+    """Return the wait, in seconds, after a number of failed attempts.
+
+    The wait doubles with each attempt. A part that depends on the key of the alert is added to it (`JITTER`).
+    """
     doubled = config.first_wait_s * 2.0 ** min(attempts - 1, 60)
     spread = zlib.crc32(f"{key} {attempts}".encode()) / 2**32
     return min(doubled, max(config.longest_wait_s, config.first_wait_s)) * (1.0 + JITTER * spread)
