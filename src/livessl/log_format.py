@@ -1,4 +1,4 @@
-"""Log lines of every process: plain text, or one JSON object a line for programs that collect logs."""
+"""Formats log lines: as plain text, or as one JSON object per line for programs that collect logs."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from livessl.clock import utc_text
 from livessl.errors import UseError
 
 VARIABLE: Final = "LIVESSL_LOG"
-"""Environment variable with the form of the log lines; processes that a command starts inherit it."""
+"""Environment variable that sets the form of the log lines. Processes that a command starts inherit it."""
 
 TEXT_FORMAT: Final = "livessl: %(message)s"
 
@@ -28,15 +28,15 @@ class LogForm(StrEnum):
 
 
 class JsonFormatter(logging.Formatter):
-    """Writes a record as one line of JSON.
+    """Formats a log record as one line of JSON.
 
-    Each has `time_utc` (RFC 3339), `level`, `logger`, `message`, `command`, `process` (its id) and `thread`. A record
-    of an exception has `exception` (its type) and `traceback` as well.
+    Every line has `time_utc` (RFC 3339), `level`, `logger`, `message`, `command`, `process` (the process id) and
+    `thread`. The record of an exception also has `exception` (the type of the exception) and `traceback`.
 
     Parameters
     ----------
     command : str
-        Command of livessl that this process runs.
+        Name of the livessl command that this process runs.
     """
 
     def __init__(self, command: str) -> None:
@@ -57,16 +57,16 @@ class JsonFormatter(logging.Formatter):
         if record.exc_info and record.exc_info[0] is not None:
             found["exception"] = record.exc_info[0].__name__
             found["traceback"] = self.formatException(record.exc_info)
-        return json.dumps(found)  # in ASCII, so that no character of a message ends the line for any reader
+        return json.dumps(found)  # in ASCII, because some other characters end a line for some readers
 
 
 def log_form() -> LogForm:
-    """Return the form that the environment asks for.
+    """Return the form of log lines that the environment variable names; text by default.
 
     Raises
     ------
     UseError
-        If it asks for an unknown one.
+        If the variable names an unknown form.
     """
     wanted = os.environ.get(VARIABLE, "") or LogForm.TEXT
     try:
@@ -76,19 +76,19 @@ def log_form() -> LogForm:
 
 
 def set_up_logging(command: str, form: LogForm, *, verbose: bool = False) -> None:
-    """Send the log of this process to stderr.
+    """Write the log of this process to stderr.
 
     Parameters
     ----------
     command : str
-        Name of the command, for JSON.
+        Name of the livessl command, which JSON lines contain.
     form : LogForm
     verbose : bool
         Also log debug messages.
     """
     level = logging.DEBUG if verbose else logging.INFO
     if not verbose:
-        logging.getLogger("alembic").setLevel(logging.WARNING)  # a dozen lines about each new database
+        logging.getLogger("alembic").setLevel(logging.WARNING)  # it logs a dozen lines about each new database
     if form is LogForm.TEXT:
         logging.basicConfig(level=level, format=TEXT_FORMAT, stream=sys.stderr)
         return

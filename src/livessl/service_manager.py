@@ -1,6 +1,7 @@
-"""Reports of this process to the service manager that started it, such as systemd: ready, alive, reloading, stopping.
+"""Notifies systemd (sd_notify) that this process is ready, alive, reloading or stopping.
 
-They are datagrams to the socket that NOTIFY_SOCKET names, as sd_notify(3) describes them. Without it nothing is sent.
+A notification is a datagram to the socket that the environment variable NOTIFY_SOCKET names: see sd_notify(3). Other
+service managers with the same protocol work as well. If the variable is not set, nothing is sent.
 """
 
 from __future__ import annotations
@@ -15,16 +16,17 @@ from typing import Final
 from livessl.clock import Clock
 
 VARIABLES: Final = ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID")
-"""Environment variables of the protocol: address, longest silence in microseconds, and the process that it is for."""
+"""Environment variables of the protocol: address of the socket, longest time without a sign of life in microseconds,
+and id of the process that must send signs of life."""
 
 STATUS_NS: Final = 1_000_000_000
-"""Shortest time between two looks at the status, in nanoseconds."""
+"""Shortest time, in nanoseconds, between two descriptions of the status."""
 
 SIGNS: Final = 4
-"""Signs of life within the longest silence, so that a late or lost one does no harm."""
+"""Number of signs of life within the longest permitted silence, so that one of them may be late or lost."""
 
 MAX_STATUS: Final = 500
-"""Most characters of a status; more would fill no line of `systemctl status`."""
+"""Largest number of characters of a status; `systemctl status` cuts longer lines."""
 
 _log = logging.getLogger(__name__)
 
@@ -54,9 +56,9 @@ class ServiceManager:
 
     @classmethod
     def of_environment(cls, clock: Clock, environment: MutableMapping[str, str] = os.environ) -> ServiceManager:
-        """Return the service manager that the environment names, and remove its variables.
+        """Return the service manager that the environment names, and remove the variables from the environment.
 
-        Programs that this process starts cannot report in its name then.
+        Programs that this process starts then cannot report in its name.
         """
         address, silence_us, process = (environment.pop(name, "") for name in VARIABLES)
         is_for_this = process in ("", str(os.getpid()))
@@ -71,18 +73,18 @@ class ServiceManager:
 
     @property
     def watches(self) -> bool:
-        """True if it kills this process unless signs of life come."""
+        """True if the service manager kills this process when signs of life are missing."""
         return self.is_there and self._silence_ns is not None
 
     def turn(self, describe: Callable[[], str]) -> None:
         """Report that this process is ready and alive; call it from the loop that must not hang, as often as it turns.
 
-        It sends little and never waits. The first call reports that the process is ready.
+        It never waits. The first call reports that the process is ready.
 
         Parameters
         ----------
         describe : callable
-            Returns the state of the process in words; called once in `STATUS_NS` at most.
+            Returns the state of the process in words. It is called at most once in `STATUS_NS`.
         """
         if self._address is None or self._is_stopping:
             return
@@ -103,8 +105,8 @@ class ServiceManager:
 
     @contextmanager
     def reloading(self) -> Iterator[None]:
-        """Report that settings are read again while the context lasts."""
-        if not self._is_ready or self._is_stopping:  # if it is not ready, `turn` reports it later
+        """Report, while the context lasts, that settings are being read again."""
+        if not self._is_ready or self._is_stopping:  # a process that is not ready is reported by `turn` later
             yield
             return
         self._send("RELOADING=1", f"MONOTONIC_USEC={self._clock.monotonic_ns() // 1000}")
@@ -121,7 +123,7 @@ class ServiceManager:
             self._send("STOPPING=1", "STATUS=stopping")
 
     def _in_words(self, describe: Callable[[], str]) -> str:
-        """Return the state in one line, or the former one if describing fails: a sign of life needs no words."""
+        """Return the state in one line; if `describe` fails, the previous state, as a sign of life needs no words."""
         try:
             return " ".join(describe().split())[:MAX_STATUS]
         except Exception:  # noqa: BLE001 - whatever fails there, the process is alive
@@ -129,7 +131,7 @@ class ServiceManager:
             return self._status
 
     def _send(self, *lines: str) -> bool:
-        """Send lines, and return whether they were sent; a service manager that takes none ends nothing here."""
+        """Send lines, and return whether they were sent; if they were not, this process goes on."""
         if self._address is None:
             return False
         address = "\0" + self._address[1:] if self._address.startswith("@") else self._address

@@ -1,6 +1,6 @@
-"""Messages whose body is JSON: greetings, acknowledgements and requests, with the checks of their fields.
+"""Encodes, decodes and checks the messages whose body is JSON: greetings, acknowledgements and requests.
 
-`wire` puts the header before them, and has the messages that carry samples and levels.
+`wire` adds the header, and encodes the messages that carry samples and levels.
 """
 
 from __future__ import annotations
@@ -12,26 +12,26 @@ from typing import Any, Final
 from livessl.core.types import FRAME_NS
 
 MAX_NAME_BYTES: Final = 64
-"""Longest array or node name, in bytes: the limit of the site file, which keeps headers short."""
+"""Longest name of an array or node, in bytes. The site file has the same limit, which keeps headers short."""
 
 MAX_RATE_HZ: Final = 384_000.0
-"""Highest sampling rate, in Hz: no sound card is faster."""
+"""Highest sampling rate, in Hz; no sound card is faster."""
 
 MAX_FRAME_INDEX: Final = (2**63 - 1) // FRAME_NS - 1
-"""Largest frame index: site times are 64-bit nanoseconds, which end in the year 2262."""
+"""Largest frame index. Site times are 64-bit integers of nanoseconds, which reach to the year 2262."""
 
 MAX_JSON_BYTES: Final = 64 * 1024
-"""Longest JSON body, in bytes: greetings and acknowledgements take a few hundred."""
+"""Longest JSON body, in bytes. Greetings and acknowledgements have a few hundred bytes."""
 
 MAX_EXTENSIONS: Final = 64
-"""Most extensions that a server may name."""
+"""Largest number of extensions that a server may list."""
 
 SECTIONS: Final = "mark-sections"
-"""Extension: marks may end with sections."""
+"""Name of the extension by which marks may end with sections."""
 
 
 class WireError(ValueError):
-    """Bytes that are not a valid message: what was expected, and what was got."""
+    """Bytes that are not a valid message. The text says what was expected, and what was received."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,20 +43,20 @@ class Hello:
     node : str
         The node's name in the site file.
     run_id : str
-        A new one at every start, after which sequence numbers begin again.
+        Identifier of the run. Every start of the node has a new one, and sequence numbers then begin again.
     arrays : dict of str to float
         The node's arrays and their sampling rates in Hz.
     replay : bool
-        True if the frames carry past times, which the server shall follow instead of its clock.
+        True if the frames have times in the past; the server then uses these times instead of its clock.
     problem : str or None
-        The present problem of the node's device, in words.
+        The current problem of the node's device, in words; None if it has none.
     backlog : dict of str to (int, int)
-        For each array with frames from before this connection, the frame index of the oldest, and that of the first
-        live frame. Frames between them come in order of time in the bandwidth that live sound leaves; another greeting
-        reports that all of them have been sent.
+        For each array that has frames from before this connection: the frame index of the oldest frame, and the frame
+        index of the first live frame. The frames between the two are sent in order of time, in the bandwidth that live
+        sound leaves. A further greeting reports that all of them have been sent.
     answers : bool
-        True if the node answers backfill requests. It is sent only to a server that has made one, because an older
-        server would reject the greeting.
+        True if the node answers backfill requests. The field is sent only to a server that has made such a request,
+        because an older server would reject the greeting.
     """
 
     node: str
@@ -75,16 +75,18 @@ class Ack:
     Parameters
     ----------
     run_id : str
-        The run of the node that is addressed.
+        The run of the node to which the message is addressed.
     received : dict of str to int
-        For each array, the frame index up to which the server has all frames that the node sent: they need not be
-        sent again while this server runs.
+        For each array, the frame index up to which the server has all frames that the node sent. The node does not send
+        these frames again while this server runs.
     settled : int or None
-        Frame index before which all sound has become stored events: no frame before it is needed again.
+        Frame index before which all sound has become stored events, so that earlier frames are not needed again; None
+        if there is no such frame index yet.
     who_are_you : bool
-        True if the server does not know this connection, or misses frames of it: the node shall greet and send again.
+        True if the server does not know this connection, or if frames of the connection are missing. The node then
+        greets and sends its frames again.
     refused : str or None
-        Reason for which the server refuses the node.
+        Reason why the server refuses the node, in words; None if it does not refuse the node.
     """
 
     run_id: str
@@ -96,16 +98,17 @@ class Ack:
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """A request of the server for frames that a node did not send. They are sent with the sequence number 0.
+    """The server's request for frames that a node did not send. The node sends these frames with sequence number 0.
 
-    An empty request, after a greeting, announces that others may follow. Nodes that do not know requests ignore them.
+    An empty request after a greeting announces that requests may follow. Nodes of older releases ignore requests.
 
     Parameters
     ----------
     run_id : str
-        The run of the node that is addressed.
+        The run of the node to which the message is addressed.
     wanted : dict of str to (int, int)
-        For each array, by its own clock, the first frame index and the one after the last.
+        For each array, the first requested frame index and the frame index after the last requested one, both by the
+        array's own clock.
     """
 
     run_id: str
@@ -114,7 +117,7 @@ class Request:
 
 @dataclass(frozen=True, slots=True)
 class Bye:
-    """A node's good-bye: it ends on purpose."""
+    """A node's good-bye, sent when the node ends on purpose."""
 
     node: str
     run_id: str
@@ -122,14 +125,14 @@ class Bye:
 
 @dataclass(frozen=True, slots=True)
 class Welcome:
-    """A server's statement of what it reads beyond this version of the protocol. Older nodes ignore it.
+    """The server's list of the extensions of the protocol that it can read. Nodes of older releases ignore the message.
 
     Parameters
     ----------
     run_id : str
-        The run of the node that is addressed.
+        The run of the node to which the message is addressed.
     reads : tuple of str
-        Names of extensions, such as `SECTIONS`; nodes ignore those that they do not know.
+        Names of extensions, such as `SECTIONS`. Nodes ignore extensions that they do not know.
     """
 
     run_id: str
@@ -140,7 +143,7 @@ JsonMessage = Hello | Ack | Bye | Request | Welcome
 
 
 def encode_json(message: JsonMessage) -> bytes:
-    """Return the body of a message."""
+    """Encode a message as JSON, the body on the wire."""
     fields = asdict(message)
     if isinstance(message, Hello) and not message.answers:
         del fields["answers"]
@@ -148,12 +151,12 @@ def encode_json(message: JsonMessage) -> bytes:
 
 
 def decode_json(type_: type[JsonMessage], body: bytes) -> JsonMessage:
-    """Return the message that a body holds.
+    """Decode a message of a given type from its body.
 
     Raises
     ------
     WireError
-        If it is not a whole, valid message of that type.
+        If the body is not a complete and valid message of that type.
     """
     what = type_.__name__.lower()
     if len(body) > MAX_JSON_BYTES:
@@ -178,7 +181,7 @@ def decode_json(type_: type[JsonMessage], body: bytes) -> JsonMessage:
 
 
 def _is_unicode(value: Any) -> bool:
-    """Return True for text without lone surrogates, which are valid in JSON but cannot be encoded again."""
+    """Return whether a value is text without lone surrogates, which JSON permits but UTF-8 cannot encode."""
     return isinstance(value, str) and not any("\ud800" <= character <= "\udfff" for character in value)
 
 

@@ -73,8 +73,8 @@ def test_overload_is_reported_with_figures_and_cure_and_its_end_too(caplog: pyte
     assert figures["delay_s"] == pytest.approx(0.2)
     assert figures["message"] == (
         "overloaded: sound waited up to 0.20 s, and the fusion works 100 % of the time on 400 messages a second; it "
-        "sheds some updates, second looks at doubtful sounds, power maps, arrays with the least evidence and frames of "
-        f"quiet. {CURE}"
+        "sheds some updates, second looks at unsure events, power maps, arrays with the least evidence and the "
+        f"correlation of quiet frames. {CURE}"
     )
     load.turns(3000, 0.0, waited=0.9)
     assert load.overload.message is None

@@ -50,7 +50,7 @@ def add_arguments(parser: Any) -> None:
         metavar="DIR",
         help="results folder (`--out`) of another experiment to include in the report; repeatable",
     )
-    add("--jobs", type=argument.positive, help="worker processes (default: one for each core)")
+    add("--jobs", type=argument.positive, help="number of parallel processes (default: one per core)")
     add("--scheduler", metavar="tcp://…", help="Dask scheduler to use instead of local processes")
     add_json(parser, "print the paths of the files written as one JSON object")
     _add_simulation(parser.add_argument_group("simulation"))

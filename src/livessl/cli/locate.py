@@ -1,4 +1,4 @@
-"""`livessl locate`: the whole pipeline on recordings, as fast as this machine can."""
+"""`livessl locate`: locates the sounds in recordings, as fast as the machine can."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def add_arguments(parser: Any) -> None:
     add_site(parser)
     add_wav(
         parser,
-        "recording of an array, WAV or FLAC; repeat for each array",
+        "WAV or FLAC recording of an array; repeat the option for each array",
         hint="If the recordings of the arrays do not begin at the same moment, set wav_offset_s in the site file",
         required=True,
     )

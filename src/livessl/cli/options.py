@@ -1,4 +1,4 @@
-"""Options that several commands share, and functions that read their values."""
+"""Options that several commands have in common, and functions that read their values."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 BESIDE_THE_SITE: Final = Path()
-"""Value of --write without a file: the file that the site file names, or else calibration/SITE.yaml."""
+"""Value of --write without a file. It stands for the file that the site file names, or for calibration/SITE.yaml."""
 
 
 def add_site(parser: Any) -> None:
@@ -27,12 +27,12 @@ def add_site(parser: Any) -> None:
 
 
 def add_method(parser: Any, default: str = "the site's") -> None:
-    """Add --method; `default` names the method without it."""
+    """Add --method; `default` describes the method that is used without the option."""
     parser.add_argument(
         "--method",
         type=argument.method,
         metavar=f"{{{','.join(sorted(METHODS))},MODULE:NAME}}",
-        help=f"localization method; MODULE:NAME imports one of your own (default: {default})",
+        help=f"localization method; MODULE:NAME imports your own estimator (default: {default})",
     )
 
 
@@ -85,7 +85,7 @@ def add_wav(parser: Any, text: str, *, hint: str = "", required: bool = False) -
         type=argument.assignment,
         default=[],
         metavar="ARRAY=FILE[,FILE…]",
-        help=f"{text}; with several files, each is one channel of the array, in order{hint and f'. {hint}'}",
+        help=f"{text}. ARRAY=a.wav,b.wav: one file per microphone, in order{hint and f'. {hint}'}",
         required=required,
     )
     parser.add_argument(
@@ -132,7 +132,7 @@ def wavs(arguments: argparse.Namespace) -> tuple[dict[str, tuple[Path, ...]], di
 
 
 def each_once(pairs: Sequence[tuple[str, T]], option: str, hint: str = "") -> dict[str, T]:
-    """Return what an option says of each array; raise `ConfigError` if it names one twice."""
+    """Return the value that an option gives for each array; raise `ConfigError` if an array is named twice."""
     names = [name for name, _ in pairs]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:

@@ -1,6 +1,6 @@
-"""`livessl relocate`: stored events by another method or calibration, answer beside answer, on all cores.
+"""`livessl relocate`: locates stored events again by another method or calibration, and prints old and new position.
 
-The recordings are in a folder, or at a running server, which locates the events itself.
+The recordings are in a folder, or at a running server, which locates its own events.
 """
 
 from __future__ import annotations
@@ -31,23 +31,23 @@ if TYPE_CHECKING:
 
 
 BEGINNING: Final = b'{"kind": "relocation"'
-"""Beginning of each line in a file of answers."""
+"""Beginning of each line in a file of results."""
 
 
 def add_arguments(parser: Any) -> None:
     """Describe the command's arguments."""
     add = parser.add_argument
-    add("clips", type=Path, nargs="?", help="folder of clips (default: that of server.clips in the site file)")
+    add("clips", type=Path, nargs="?", help="folder of clips (default: server.clips of the site file)")
     parser.add_argument("--site", type=Path, help="site file; not with --url")
-    add_server(parser, "it locates its own events, one at a time, and stores nothing; for operators")
-    add_method(parser, "that by which each event was located")
+    add_server(parser, "the server relocates its own events (operator token required; nothing is stored)")
+    add_method(parser, "the method by which each event was located before")
     add_joint(parser)
     add(
         "--set-up",
         choices=("then", "now"),
         default="then",
-        help="poses and speed of sound; then: as when each event was located, now: as in the site file with its "
-        "calibration, or at the server (default: then)",
+        help="poses and speed of sound: `then` = those used for the event; `now` = those of the site file and "
+        "calibration (with --url: of the server) (default: then)",
     )
     add("--since", type=argument.time, metavar="TIME", help="only events that began at TIME or later (RFC 3339)")
     add("--until", type=argument.time, metavar="TIME", help="only events that began at TIME or earlier (RFC 3339)")
@@ -55,9 +55,9 @@ def add_arguments(parser: Any) -> None:
         "--out",
         type=Path,
         metavar="FILE",
-        help="append the answers to FILE, one JSON object a line, and skip the events that FILE already answers",
+        help="append the results to FILE, one JSON object per line, and skip events that have a result in FILE",
     )
-    add("--jobs", type=argument.positive, help="processes (default: all cores)")
+    add("--jobs", type=argument.positive, help="number of parallel processes (default: one per core)")
     add_json(parser)
 
 
@@ -92,11 +92,11 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 class Archive(Protocol):
-    """Recordings of events, and what they are located again with."""
+    """Recordings of events, and the method and set-up by which they are located again."""
 
     @property
     def method(self) -> str | None:
-        """The method; None for that of each event."""
+        """The method; None for the method by which each event was located."""
         ...
 
     @property
@@ -106,7 +106,7 @@ class Archive(Protocol):
 
     @property
     def digest(self) -> str:
-        """Digest of everything but the recordings that decides the answers."""
+        """Digest of everything, except the recordings, on which the results depend."""
         ...
 
     @property
@@ -115,14 +115,14 @@ class Archive(Protocol):
         ...
 
     def ids(self, since_ns: int | None, until_ns: int | None, known: Collection[str] = ()) -> list[str]:
-        """Return the ids of the events of a span that have recordings, which may be unreadable.
+        """Return the ids of the events of a span that have recordings, readable or not.
 
-        Events of which that is `known` need not be looked up.
+        Events in `known` are included without being looked up.
         """
         ...
 
     def relocate(self, event_ids: Sequence[str]) -> Iterator[dict[str, Any]]:
-        """Yield the answers for some events as they come."""
+        """Yield the results for some events in the order in which they are ready."""
         ...
 
 

@@ -1,4 +1,4 @@
-"""REST of a hub: the sites, and events, arrays, tracks and alerts of all of them."""
+"""The REST routes of a hub: its sites, and the events, arrays, tracks and alerts of all sites."""
 
 from __future__ import annotations
 

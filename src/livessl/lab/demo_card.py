@@ -1,7 +1,6 @@
-"""The demo with a sound card: a virtual audio interface plays the scene, and one node records both arrays from it.
+"""Runs the demo with a virtual audio interface: it plays the scene, and one node records both arrays from it.
 
-Everything from the interface's driver on is what a real set-up has: ALSA, PortAudio, the node with its device process,
-the server and the dashboard.
+ALSA, PortAudio, the node with its device process, the server and the dashboard are the same as in a real set-up.
 """
 
 from __future__ import annotations
@@ -24,17 +23,17 @@ from livessl.site.load import load_site
 from livessl.site.models import Site
 
 CHANNELS: Final = 18
-"""Inputs of the virtual interface, as of a UMC1820."""
+"""Number of inputs of the virtual interface; a UMC1820 has as many."""
 
 RATE_HZ: Final = 48000.0
 PPM: Final = 35.0
-"""Error of its crystal, in parts per million."""
+"""Error of the virtual interface's sampling rate, in parts per million."""
 
 NODE: Final = "lab-pc"
 
 LEAD_NS: Final = 6_000_000_000
-"""Time, in nanoseconds, from the start of the node to the scene's first sample: it opens the interface and learns the
-background noise meanwhile."""
+"""Time, in nanoseconds, from the start of the node to the first sample of the scene. Meanwhile the node opens the
+interface and learns the background noise."""
 
 
 def prepare(
@@ -72,7 +71,7 @@ def prepare(
 def running(
     directory: Path, site: Site, scene: Scene, interfaces: Interfaces, *, loop: bool, clock: Clock
 ) -> Iterator[demo.Running]:
-    """Run server and node as processes while the context lasts; the node ends after the scene unless it repeats.
+    """Run server and node as processes while the context lasts; the node ends after the scene unless the scene repeats.
 
     Raises
     ------
@@ -96,7 +95,7 @@ def running(
 
 
 def _play_from(interface: Interface, scene: Scene, start_ns: int, clock: Clock) -> None:
-    """Make the scene begin at a future time; until then its end is played, which is silent or left out."""
+    """Make the scene begin at a future time; until then the interface plays the end of the scene, which is silent."""
     rounds = -(-LEAD_NS // round(1e9 * scene.duration_s))
     before_ns = round(rounds * 1e9 * scene.duration_s / (1.0 + 1e-6 * PPM))
     interface.begin(clock.monotonic_ns() + start_ns - clock.now_ns() - before_ns)

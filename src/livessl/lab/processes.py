@@ -1,4 +1,4 @@
-"""The project's own commands as processes: start, wait until ready, stop."""
+"""Runs livessl commands as processes: starts them, waits until a server is ready, and stops them."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from livessl.clock import Clock
 from livessl.errors import RunError
 
 READY_NS: Final = 300_000_000_000
-"""Longest start of a server, in nanoseconds, on a machine that is very busy."""
+"""Longest time, in nanoseconds, that a server may take to start on a very busy machine."""
 
 POLL_NS: Final = 50_000_000
-"""Time, in nanoseconds, between two checks whether a server is ready."""
+"""Interval, in nanoseconds, at which it is checked whether a server is ready."""
 
 END_S: Final = 5.0
 """Time, in seconds, after which a process that does not stop is killed."""
@@ -28,12 +28,12 @@ class NotStartedError(RunError):
 
 
 def start(*arguments: str, environment: Mapping[str, str] | None = None) -> subprocess.Popen[bytes]:
-    """Run a livessl command, with this process's environment or another one."""
+    """Start a livessl command with an environment; None for the environment of this process."""
     return subprocess.Popen([sys.executable, "-m", "livessl", *arguments], env=environment)  # noqa: S603 - this package
 
 
 def wait_until_ready(url: str, started: Sequence[subprocess.Popen[bytes]], clock: Clock) -> None:
-    """Return when the server at `url` answers.
+    """Wait until the server at `url` answers.
 
     Raises
     ------
@@ -51,7 +51,7 @@ def wait_until_ready(url: str, started: Sequence[subprocess.Popen[bytes]], clock
 
 
 def end(started: Sequence[subprocess.Popen[bytes]]) -> None:
-    """Stop processes, the youngest first, and wait for them."""
+    """Stop processes, the last started first, and wait until they have ended."""
     for process in reversed(started):
         if process.poll() is None:
             process.send_signal(signal.SIGTERM)

@@ -48,7 +48,7 @@ class PrivacyMode(StrEnum):
 
 
 class Door(StrEnum):
-    """The socket of the nodes, or the HTTP server."""
+    """The entrance at which a caller was refused: the port of the nodes, or HTTP, which serves API and WebSockets."""
 
     NODES = "nodes"
     HTTP = "http"
@@ -221,11 +221,11 @@ class LoadState(StrEnum):
 
 
 class Shed(StrEnum):
-    """Work that is given up under overload, in this order.
+    """Work that is shed under overload, in this order.
 
-    `updates`: only some windows of a sound that goes on are located. `second_looks`: a sound whose first answer is
-    doubtful is not located again by other evidence. `maps`: no power maps are drawn. `arrays`: sounds are located from
-    the few arrays to which they are clearest. `quiet`: frames of quiet are correlated only if sound follows.
+    `updates`: only some windows of a continuing sound are located. `second_looks`: an unsure event is not located again
+    from other evidence. `maps`: no power maps are drawn. `arrays`: sounds are located only from the few arrays with the
+    highest power relative to their background. `quiet`: quiet frames are correlated only if sound follows.
     """
 
     UPDATES = "updates"
@@ -239,14 +239,16 @@ class Load(Model):
     """Load of the fusion, over the last five seconds."""
 
     state: LoadState
-    level: int = Field(ge=0, description="How much is shed: 0 is nothing, each level is more.", examples=[0])
+    level: int = Field(
+        ge=0, description="Level of shedding: at 0 nothing is shed, and each level sheds more.", examples=[0]
+    )
     since_utc: UtcTime | None = Field(description="Since when the server is overloaded; null while it keeps up.")
     delay_s: float = Field(
         ge=0, description="Longest wait of a message before it was processed, in seconds.", examples=[0.012]
     )
-    busy: float = Field(ge=0, le=1, description="Share of the time that the fusion works.", examples=[0.31])
-    messages_per_s: float = Field(ge=0, description="Messages of the nodes processed a second.", examples=[320.0])
-    shed: list[Shed] = Field(description="What is shed now.", examples=[[]])
+    busy: float = Field(ge=0, le=1, description="Share of the time in which the fusion computes.", examples=[0.31])
+    messages_per_s: float = Field(ge=0, description="Messages of the nodes processed per second.", examples=[320.0])
+    shed: list[Shed] = Field(description="Work that is shed now.", examples=[[]])
     updates_shed: int = Field(ge=0, description="Updates that were shed since the start.", examples=[0])
     message: str | None = Field(
         description="Figures and cure in words, while the server is overloaded; otherwise null.", examples=[None]

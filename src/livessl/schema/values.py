@@ -327,7 +327,9 @@ class Counters(Model):
     sequence_gaps: int = Field(
         ge=0, description="Frames missing amid live sound; they are requested again.", examples=[0]
     )
-    backfilled: int = Field(ge=0, description="Buffered frames that the node sent later.", examples=[0])
+    backfilled: int = Field(
+        ge=0, description="Frames from before a connection that the node sent over it: its backlog.", examples=[0]
+    )
     asked: int = Field(
         ge=0, description="Sounds that it did not detect and for which its frames were requested.", examples=[3]
     )

@@ -1,7 +1,7 @@
-"""Power maps for people, drawn on demand by a thread of their own, so that they never delay localization.
+"""Draws power maps on demand, on its own thread, so that maps never delay localization.
 
-A reader gets the map of one array once, by `newest`; a watcher gets those of every window, by `watching`. A window
-costs nothing until it is drawn: it holds the evidence that maps are drawn from, not maps.
+`newest` returns one map once; `watching` delivers the maps of every window. A window holds the evidence from which maps
+are drawn, not the maps, so it costs nothing until it is drawn.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from livessl.core.locate.estimator import PowerMaps
 from livessl.core.types import Float32Array, Window
 
 FUSED: Final = "fused"
-"""Name of the map of all arrays together, where the API takes an array's name."""
+"""Name of the map of all arrays together; the API accepts it in place of an array's name."""
 
 VIEWS: Final = {"floor": 2, "side": 0, "front": 1}
-"""Axis over which the projection of each view takes the maximum."""
+"""Axis along which each view takes the maximum of the map."""
 
 INTERVAL_NS: Final = 100_000_000
-"""Shortest interval between two drawings, in nanoseconds: ten a second are enough for people."""
+"""Shortest interval, in nanoseconds, between two drawings: ten per second are enough for people."""
 
 PATIENCE_S: Final = 5.0
-"""Longest wait of a reader for a drawing, in seconds: the first one of a fine grid computes its tables."""
+"""Longest wait for a drawing, in seconds; the first drawing of a fine grid also computes the tables of the grid."""
 
 HEADER: Final = struct.Struct("<4sBBHq7f2H")
 """Header of a picture in bytes: magic, version, view, length of this header, time_ns, age in seconds, least and
@@ -42,7 +42,7 @@ _VERSION: Final = 1
 _log = logging.getLogger(__name__)
 
 Draw = Callable[[Window, frozenset[str]], PowerMaps]
-"""Draws the fused map of a window, and those of the arrays named."""
+"""A function that draws the fused map of a window, and the maps of the named arrays."""
 
 
 @dataclass(frozen=True, slots=True)

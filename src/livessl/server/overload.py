@@ -1,6 +1,7 @@
-"""The server's load: how far it is behind the sound, what it sheds for that, and how it reports both.
+"""Measures the load of the server, sheds work under overload, and reports both.
 
-The fusion thread measures; `core.stream.load_policy` decides. Every thread may read the figures.
+The fusion thread measures its own delay in every turn, one pass of its loop, and `core.stream.load_policy` decides
+which work is shed. Every thread may read the figures.
 """
 
 from __future__ import annotations
@@ -16,14 +17,14 @@ from livessl.core.stream.load_policy import LEVELS, NOTHING_SHED, PROMPT_S, Load
 from livessl.server.api.encode import JsonObject
 
 MEMORY_NS: Final = 5_000_000_000
-"""Time, in nanoseconds, of which the figures are means and maxima."""
+"""Length, in nanoseconds, of the span over which the figures are means and maxima."""
 
 _WORDS: Final = {
     "updates": "some updates",
-    "second_looks": "second looks at doubtful sounds",
+    "second_looks": "second looks at unsure events",
     "maps": "power maps",
     "arrays": "arrays with the least evidence",
-    "quiet": "frames of quiet",
+    "quiet": "the correlation of quiet frames",
 }
 
 CURE: Final = "Use a faster machine or fewer arrays per server, raise fusion.update_s, or stop other programs on it"
@@ -33,7 +34,7 @@ _log = logging.getLogger(__name__)
 
 
 class _Turn(NamedTuple):
-    """One turn of the fusion thread."""
+    """Figures of one turn of the fusion thread."""
 
     ended_ns: int
     lasted_ns: int
@@ -43,7 +44,7 @@ class _Turn(NamedTuple):
 
 
 class _Figures(NamedTuple):
-    """Figures over the last turns."""
+    """Figures over the turns of the last `MEMORY_NS`."""
 
     busy: float
     messages_per_s: float
@@ -51,9 +52,9 @@ class _Figures(NamedTuple):
 
 
 class Overload:
-    """Measures the fusion's delay, and decides what is shed.
+    """Measures the delay of the fusion, and decides which work is shed.
 
-    `note` is for the fusion thread.
+    Only the fusion thread may call `note`.
 
     Parameters
     ----------
@@ -65,9 +66,9 @@ class Overload:
         self._policy = LoadPolicy()
         self._turns: deque[_Turn] = deque()
         self._lasted_ns = self._waited_ns = self._messages = 0  # sums over the turns
-        self._lock = threading.Lock()  # of the turns and their sums
+        self._lock = threading.Lock()  # protects the turns and their sums
         self._ended_ns = clock.monotonic_ns()
-        self._taken = self._ended_ns, 0.0  # when the fusion took messages last, and how long the first had waited
+        self._taken = self._ended_ns, 0.0  # time of the last turn, and how long its first message had waited
         self._since_ns: int | None = None
         self.relief = NOTHING_SHED
         """The work that is shed now."""
@@ -75,18 +76,18 @@ class Overload:
         """Number of windows that were not located because of overload, since the start."""
 
     def note(self, delay_s: float, messages: int, waited_ns: int, *, sheds: bool) -> Relief:
-        """Take in a turn of the fusion thread; return what is shed from now on.
+        """Take in the figures of a turn of the fusion thread; return the work that is shed from now on.
 
         Parameters
         ----------
         delay_s : float
-            How long the first message of the turn had waited; 0 if there was none.
+            Time for which the first message of the turn had waited, seconds; 0 without a message.
         messages : int
             Number of messages of the turn.
         waited_ns : int
-            How long the thread waited for them.
+            Time for which the thread waited for these messages, nanoseconds.
         sheds : bool
-            Whether anything may be shed: not in a replay, which can wait.
+            Whether work may be shed; False in a replay, which can wait.
         """
         now_ns = self._clock.monotonic_ns()
         self._add(_Turn(now_ns, now_ns - self._ended_ns, waited_ns, messages, delay_s), 1)
@@ -107,9 +108,9 @@ class Overload:
         return relief
 
     def unheard_ns(self) -> int:
-        """Return how long ago, in nanoseconds, the messages arrived that the fusion took last.
+        """Return the age, in nanoseconds, of the messages that the fusion took last.
 
-        What has come since is not known yet, so that an array which seems silent for no longer may have sent sound.
+        Later messages are not known yet. An array that seems silent for a shorter time may therefore have sent sound.
         """
         taken_ns, delay_s = self._taken
         return self._clock.monotonic_ns() - taken_ns + round(1e9 * delay_s)
@@ -144,7 +145,7 @@ class Overload:
         )
 
     def _add(self, turn: _Turn, sign: int) -> None:
-        """Add the newest turn, or with a negative sign take out the oldest."""
+        """Add the newest turn to the sums, or with a negative sign remove the oldest one."""
         with self._lock:
             if sign > 0:
                 self._turns.append(turn)

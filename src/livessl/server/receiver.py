@@ -1,4 +1,7 @@
-"""The nodes' socket and its thread. `ingest` decides what is accepted and acknowledged."""
+"""Receives messages from nodes on a ZeroMQ socket, on its own thread.
+
+`ingest` decides which messages are accepted and acknowledged.
+"""
 
 from __future__ import annotations
 
@@ -29,13 +32,13 @@ POLL_MS: Final = 20
 """Longest wait for messages, in milliseconds, before the thread sends the acknowledgements that are due."""
 
 PEER_MESSAGES: Final = 64
-"""Messages of one node that ZeroMQ receives before they are read: 1.6 s of two arrays. The rest waits with the node,
-whose memory is bounded, while by ZeroMQ's default each node would fill 35 MB here. With 8, a node that ended on a busy
-machine could not hand over its last messages in time."""
+"""Most messages of one node that ZeroMQ receives before they are read: 1.6 s of two arrays. Further messages wait in
+the node, whose memory is bounded. With ZeroMQ's default, each node would fill 35 MB of the server's memory. With 8
+messages, a node that ended on a busy machine could not deliver its last messages in time."""
 
 DRAIN: Final = 64
-"""Most messages that are read before they are put into the queue: one frame index of 64 arrays. Waking the fusion for
-each of them costs more than decoding it."""
+"""Most messages that are read before they are put into the queue: one frame index of 64 arrays. Waking the fusion
+thread for a message costs more than decoding the message."""
 
 BUSY_MESSAGES: Final = 100
 """Queue length from which the fast acknowledgements (`ingest.SOON_NS`) pause, so that backlogs do not delay live
@@ -45,11 +48,11 @@ _log = logging.getLogger(__name__)
 
 
 class BindError(RunError):
-    """An address of the server cannot be taken."""
+    """The server cannot bind to one of its addresses."""
 
 
 def address_cure(number: int | None) -> str:
-    """Return the cure for an address that cannot be taken, by the system's error number."""
+    """Return the cure for an address that the server cannot bind to, by the system's error number."""
     if number == errno.EADDRINUSE:
         return "is another server running? Stop it or choose another port"
     if number == errno.EACCES:

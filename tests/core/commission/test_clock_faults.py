@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from livessl.core.commission.clocks import LEAST_SOUNDS, Rises, find_clock_faults
-from livessl.core.commission.envelopes import HOP_S, MOST_GAP_S, EnvelopeMeter
+from livessl.core.commission.envelopes import INTERVAL_S, MOST_GAP_S, EnvelopeMeter
 from livessl.core.commission.finding import Finding
 from livessl.core.types import FloatArray
 from livessl.examination import examine_parts
@@ -33,8 +33,8 @@ def starts_s(seed: int, count: int = 10) -> FloatArray:
 
 def heard(sounds_s: FloatArray, rng: np.random.Generator, start_s: float = -50.0) -> Rises:
     """What one array records of sounds: it rises by different amounts, at most one piece earlier or later."""
-    values = np.zeros(round((max(sounds_s, default=0.0) - start_s + 5.0) / HOP_S))
-    at = np.round((sounds_s - start_s) / HOP_S).astype(int) + rng.integers(-1, 2, len(sounds_s))
+    values = np.zeros(round((max(sounds_s, default=0.0) - start_s + 5.0) / INTERVAL_S))
+    at = np.round((sounds_s - start_s) / INTERVAL_S).astype(int) + rng.integers(-1, 2, len(sounds_s))
     np.add.at(values, at, rng.uniform(1.0, 5.0, len(sounds_s)))
     return Rises(start_s, values)
 
@@ -124,7 +124,7 @@ def test_rises_do_not_depend_on_how_samples_are_cut_into_blocks(seed: int, rate_
     for first, last in pairwise(edges):
         pieces.push(first, samples[:, first:last])
     assert pieces.rises() == pytest.approx(whole.rises(), rel=1e-5)
-    assert abs(float(whole.rises().argmax()) * HOP_S - 6_000 / rate_hz) <= HOP_S
+    assert abs(float(whole.rises().argmax()) * INTERVAL_S - 6_000 / rate_hz) <= INTERVAL_S
 
 
 @few
@@ -137,7 +137,7 @@ def test_gap_keeps_time_and_is_no_rise(seed: int, gap_s: float) -> None:
     meter.push(0, quiet)
     meter.push(later, loud)
     rises = meter.rises()
-    assert abs(float(rises.argmax()) * HOP_S - (later + 4_000) / 8_000.0) <= HOP_S
+    assert abs(float(rises.argmax()) * INTERVAL_S - (later + 4_000) / 8_000.0) <= INTERVAL_S
     assert np.count_nonzero(rises > 1.0) <= 2
 
 
@@ -160,7 +160,7 @@ def test_one_noisy_and_one_dead_channel_do_not_hide_the_rises() -> None:
     samples[0], samples[1] = 0.0, 0.3 * rng.standard_normal(16_000)
     meter = EnvelopeMeter(16_000.0)
     meter.push(0, samples)
-    assert abs(float(meter.rises().argmax()) * HOP_S - 0.5) <= HOP_S
+    assert abs(float(meter.rises().argmax()) * INTERVAL_S - 0.5) <= INTERVAL_S
 
 
 def test_recordings_of_a_clock_that_is_off_are_told_as_such() -> None:

@@ -1,4 +1,4 @@
-"""Finds clocks that differ by so much that one sound is two events, by what rises in the recordings of both.
+"""Finds clocks that differ so much that one sound becomes two events, by comparing the rises in their recordings.
 
 Smaller differences are estimated and corrected while sounds are located (`livessl.core.stream.clock_offsets`).
 """
@@ -13,34 +13,38 @@ from typing import Final
 import numpy as np
 import scipy
 
-from livessl.core.commission.envelopes import HOP_S
+from livessl.core.commission.envelopes import INTERVAL_S
 from livessl.core.commission.finding import Finding, Severity
 from livessl.core.types import FloatArray
 
 LEAST_OFF_S: Final = 0.3
-"""Difference of two clocks, in seconds, from which it is an error: sounds that far apart are two events."""
+"""Difference of two clocks, in seconds, from which it is reported as an error, because one sound then becomes two
+events."""
 
 MOST_OFF_S: Final = 60.0
-"""Greatest difference, in seconds, that is looked for."""
+"""Greatest difference of two clocks, in seconds, that can be found."""
 
 LEAST_FIT: Final = 0.3
-"""Least normalized correlation of the rises by two clocks for which they are taken to show the same sounds."""
+"""Least normalized correlation of the rises at which the recordings of two clocks count as recordings of the same
+sounds."""
 
 MOST_RIVAL: Final = 0.7
-"""Highest correlation with any other difference, as a share of this one: sounds at equal intervals fit many."""
+"""Highest correlation at any other difference, as a share of the correlation at the best one. Sounds at equal intervals
+correlate at several differences."""
 
 LEAST_SOUNDS: Final = 4
-"""Fewest rises, apart from each other, that have to fit: two or three sounds may follow one another alike by chance."""
+"""Fewest separate rises that both recordings must have in common. Two or three sounds can have the same intervals by
+chance."""
 
 APART_S: Final = 0.15
-"""Distance, in seconds, from which two differences, or two rises, are not the same one."""
+"""Least distance, in seconds, of two differences, or of two rises, that count as separate."""
 
 _SMOOTH: Final = np.array([0.25, 0.5, 0.25])
 _BLOCK: Final = 60_000
-"""Pieces, ten minutes, that are correlated at one time."""
+"""Number of values of `Rises` that are correlated at one time: ten minutes."""
 
 _LARGE: Final = 0.2
-"""Share of the largest product of rises from which a product counts as a sound."""
+"""Least product of rises that counts as a sound, as a share of the largest product."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,9 +54,9 @@ class Rises:
     Parameters
     ----------
     start_s : float
-        When the recording begins by its clock, seconds.
+        Time at which the recording begins, by its own clock, seconds.
     values : (n,) float64
-        `EnvelopeMeter.rises` of it.
+        `EnvelopeMeter.rises` of the recording.
     """
 
     start_s: float
@@ -67,12 +71,12 @@ class _Difference:
 
 
 def find_clock_faults(recordings: Mapping[str, Rises]) -> Iterator[Finding]:
-    """Yield an error for every clock that differs by `LEAST_OFF_S` or more from the one that most others agree with.
+    """Yield an error for every clock that differs by `LEAST_OFF_S` or more from the majority of the others.
 
     Parameters
     ----------
     recordings : mapping of clock to Rises
-        What one array recorded by each clock.
+        The rises in the recording of one array for each clock.
     """
     found = {
         (one, other): difference
@@ -87,7 +91,7 @@ def find_clock_faults(recordings: Mapping[str, Rises]) -> Iterator[Finding]:
     for (one, other), difference in sorted(found.items(), key=lambda pair: -pair[1].fit):
         if abs(difference.later_s) < LEAST_OFF_S:
             continue
-        # the one with fewer friends is off; of two alike, the second one of the site file
+        # the clock that agrees with fewer others is wrong; if both agree with as many, the later one in the site file
         is_first = agreeing[one] < agreeing[other]
         off, right = (one, other) if is_first else (other, one)
         if off in reported:
@@ -96,37 +100,37 @@ def find_clock_faults(recordings: Mapping[str, Rises]) -> Iterator[Finding]:
         later_s = -difference.later_s if is_first else difference.later_s
         side = "ahead of" if later_s > 0.0 else "behind"
         message = (
-            f"the clock of {off!r} is {abs(later_s):.1f} s {side} that of {right!r}: {difference.sounds} sounds come "
-            "again with that difference"
+            f"the clock of {off!r} is {abs(later_s):.1f} s {side} that of {right!r}: {difference.sounds} sounds "
+            "are in both recordings with that difference"
         )
-        cure = "set the clocks of both by NTP; what was recorded with them does not fit together"
+        cure = "set the clocks of both by NTP; recordings made with these clocks cannot be combined"
         yield Finding("clock", None, None, Severity.ERROR, min(0.99, 0.5 + difference.fit / 2.0), message, cure)
 
 
 def _difference(one: Rises, other: Rises) -> _Difference | None:
-    """Return by how much the other's sounds are later; None if no difference stands out."""
+    """Return by how much the sounds of the other recording are later; None if no difference stands out."""
     values = [np.convolve(rises.values, _SMOOTH, mode="same") for rises in (one, other) if rises.values.any()]
     if len(values) < 2:
         return None
     began_s = other.start_s - one.start_s
-    middle, reach = round(-began_s / HOP_S), round(MOST_OFF_S / HOP_S)
+    middle, reach = round(-began_s / INTERVAL_S), round(MOST_OFF_S / INTERVAL_S)
     lags = np.arange(max(middle - reach, 1 - len(values[0])), min(middle + reach, len(values[1]) - 1) + 1)
     if not len(lags):
         return None
     norm = float(np.sqrt((values[0] ** 2).sum() * (values[1] ** 2).sum()))
     fits = _correlation(values[0], values[1], int(lags[0]), len(lags)) / norm
     top = int(fits.argmax())
-    apart = np.abs(lags - lags[top]) > APART_S / HOP_S
+    apart = np.abs(lags - lags[top]) > APART_S / INTERVAL_S
     if fits[top] < LEAST_FIT or fits[apart].max(initial=0.0) > MOST_RIVAL * fits[top]:
         return None
     sounds = _sounds(values[0], values[1], int(lags[top]))
     if sounds < LEAST_SOUNDS:
         return None
-    return _Difference(began_s + float(lags[top]) * HOP_S, sounds, float(fits[top]))
+    return _Difference(began_s + float(lags[top]) * INTERVAL_S, sounds, float(fits[top]))
 
 
 def _correlation(one: FloatArray, other: FloatArray, first: int, count: int) -> FloatArray:
-    """Sum of `one[n] other[n + lag]` over n for `count` lags from `first` on, block by block: sessions are long."""
+    """Sum of `one[n] other[n + lag]` over n for `count` lags from `first` on, in blocks, because sessions are long."""
     total = np.zeros(count)
     size = scipy.fft.next_fast_len(_BLOCK + count, real=True)
     for begin in range(0, len(one), _BLOCK):
@@ -142,9 +146,9 @@ def _correlation(one: FloatArray, other: FloatArray, first: int, count: int) -> 
 
 
 def _sounds(one: FloatArray, other: FloatArray, lag: int) -> int:
-    """Count the rises, apart from each other, that two recordings have in common at a lag."""
+    """Count the separate rises that two recordings have in common at a lag."""
     first, second = (one[-lag:], other) if lag < 0 else (one, other[lag:])
     length = min(len(first), len(second))
     product = first[:length] * second[:length]
     at = np.flatnonzero(product > _LARGE * product.max(initial=0.0))
-    return 0 if not len(at) else 1 + int(np.count_nonzero(np.diff(at) > APART_S / HOP_S))
+    return 0 if not len(at) else 1 + int(np.count_nonzero(np.diff(at) > APART_S / INTERVAL_S))

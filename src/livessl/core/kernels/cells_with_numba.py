@@ -1,6 +1,7 @@
 """The tables of the peak search compiled by numba: lags of the cells of a grid, which do not depend on the sound.
 
-Each kernel has a twin in `search_with_numpy`, which documents it. Both find the same lags, bit for bit.
+`search_with_numpy` has a function of the same name for each kernel, and documents it. Both find the same lags, bit for
+bit.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
-"""The kernels of the peak search compiled by numba. Each has a twin in `search_with_numpy`, which documents it.
+"""Kernels of the peak search that numba compiles: branch and bound over the cells of the grid.
 
-Both find the same points and powers, bit for bit. Kernels that call each other stand in one file, because numba does
-not compile a function again when one of another file changes.
+`search_with_numpy` has a function of the same name and arguments for each kernel, with the documentation. Both
+implementations find the same points and powers, bit for bit. Kernels that call each other stand in one file, because
+numba does not compile a function again when a function of another file changes.
 """
 
 from __future__ import annotations
@@ -14,16 +15,16 @@ from livessl.core.kernels.arguments import BLOCKS, REACHES, RUNS
 from livessl.core.kernels.jit import jit
 
 _CUBES_AT_ONCE: Final = 1
-"""Cubes whose cells are bounded at once."""
+"""Number of cubes whose cells get their upper bounds at one time."""
 
 _CELLS_AT_ONCE: Final = 64
-"""Cells whose halves are bounded at once."""
+"""Number of cells whose halves get their upper bounds at one time."""
 
 _MANY: Final = 100
-"""Cells left from which their halves are bounded before their points are examined."""
+"""Number of remaining cells from which the halves get upper bounds before any points are examined."""
 
 _PASSES: Final = 4
-"""Passes in which the cells that are left are examined, from the highest bounds down."""
+"""Number of passes over the remaining cells, which are examined in descending order of their bounds."""
 
 _compiled = jit(error_model="numpy")
 

@@ -1,8 +1,8 @@
-"""The kernels of the peak search on NumPy alone: lags of cells, upper bounds, and branch and bound.
+"""Kernels of the peak search on NumPy alone: lags of cells, upper bounds, and branch and bound.
 
-Sums run in one order everywhere: over the pairs of an array, then over the arrays. Rounding to float32 keeps the order
-of numbers, so a sum of maxima is never below a sum of any of the numbers that they are maxima of, rounding included:
-the bounds are exact. Names of dimensions are those of `arguments`.
+All sums run in the same order: over the pairs of an array, then over the arrays. Rounding to float32 keeps the order of
+numbers. A sum of maxima is therefore, rounding included, never below the sum of any values under these maxima, and the
+bounds are exact. The names of dimensions are explained in `arguments`.
 
 A lag's place on the fine axis is `int((|r - r_k| - |r - r_i|) * scale + offset)` in float32.
 """
@@ -18,10 +18,11 @@ from livessl.core.kernels.arguments import BLOCKS, NO_LAG, RUNS, Axes, SearchBou
 from livessl.core.types import BoolArray, Float32Array, IntArray, UInt16Array
 
 _SLAB_POINTS: Final = 1 << 15
-"""Grid points whose distances are computed at once: as many as fit the second-level cache."""
+"""Number of grid points whose distances are computed at one time: as many as fit into the second-level cache."""
 
 _CELLS_AT_ONCE: Final = 64
-"""Most cells whose points are examined at once. The search begins with one, because mostly few are needed."""
+"""Largest number of cells whose points are examined at one time. The search begins with one cell, because few are
+usually needed."""
 
 
 def lag_places(

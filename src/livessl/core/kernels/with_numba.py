@@ -1,6 +1,6 @@
-"""The kernels compiled by numba. Each has a twin of the same name and arguments in `with_numpy`, which documents it.
+"""Kernels that numba compiles. `with_numpy` has a function of the same name and arguments for each, and documents it.
 
-Kernels of maps and of the search match their twins bit for bit; the other kernels differ only by rounding.
+Kernels of maps and of the search give the same bits as those functions; the other kernels differ only by rounding.
 """
 
 from __future__ import annotations
@@ -168,7 +168,7 @@ def onset_weights(  # type: ignore[no-untyped-def]  # noqa: C901 - loops
             noise[b] += (now - noise[b]) * share
 
 
-def look_up_table(places, columns):  # type: ignore[no-untyped-def]  # noqa: ARG001 - as its twin
+def look_up_table(places, columns):  # type: ignore[no-untyped-def]  # noqa: ARG001 - as in `with_numpy`
     """Return the table that `add_power` needs for the places of points: the places themselves."""
     return places
 

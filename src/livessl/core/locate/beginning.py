@@ -1,8 +1,7 @@
-"""Finds the frames in which a sound begins, by which it was detected. It sees how loud frames were, and when.
+"""Finds the frames in which a sound begins. It uses only the power and time of frames.
 
-Music, and a noise that begins after the sound, have onsets as clear as those of the sound, and nothing before the sound
-shows that they are not it. The first frames of the sound do: a place from which nothing came when it began is that of
-something else.
+Music, or a noise that starts after the sound, can have onsets just as clear, and the pre-roll does not reveal it. The
+first frames do: if a place emitted nothing when the sound began, another source is there.
 """
 
 from __future__ import annotations
@@ -15,17 +14,18 @@ import numpy as np
 from livessl.core.locate.estimator import Sound
 
 FRAMES: Final = 4
-"""Frames, 0.2 s, that a beginning has from the first active frame of any array on. They hold the first onset at every
-array of a room, and little of what comes later."""
+"""Number of frames in a beginning, counted from the first active frame of any array: 0.2 s. They contain the first
+onset at every array of a room, and little of the sound after it."""
 
 BEFORE: Final = 1
-"""Frames before the first active one that belong to the beginning: the first foot of an onset is in them."""
+"""Number of frames before the first active one that belong to the beginning, because an onset may start in them."""
 
 
 def first_frame(sounds: Mapping[str, Sound]) -> int | None:
-    """Return the frame index at which a sound begins at the first of the arrays; None if that is not known.
+    """Return the frame index at which a sound begins at the array that it reaches first; None if it is not known.
 
-    It is not known without a pre-roll: the first frame of a window of a longer sound is no beginning.
+    The frame index is not known if there is no pre-roll, because the first frame of a window can be in the middle of a
+    longer sound.
     """
     courses = [sound.course for sound in sounds.values() if sound.course is not None and sound.onsets]
     begun = [course.begin for course in courses if course.frame_indices[0] < course.begin]
@@ -33,7 +33,7 @@ def first_frame(sounds: Mapping[str, Sound]) -> int | None:
 
 
 def beginning(sound: Sound, first: int | None) -> slice | None:
-    """Return which of a sound's `onsets` belong to its beginning; None if that is not known, or if all of them do.
+    """Return the slice of a sound's `onsets` that belong to its beginning; None if it is not known, or if all do.
 
     Parameters
     ----------

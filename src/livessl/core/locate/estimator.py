@@ -1,7 +1,7 @@
-"""The interface of estimators, and the registry to which you add your own.
+"""The interface of estimators, and the registry of localization methods.
 
-`Estimator` is the protocol. `livessl.core.locate.map_estimator.MapEstimator` is a base class that leaves only
-`locate` to write.
+`Estimator` is the protocol, and `register` adds a method. `livessl.core.locate.map_estimator.MapEstimator` is a base
+class whose subclasses have to implement only `locate`.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from livessl.core.types import GCC, ArraySpec, Candidate, Evidence, Float32Array
 
 @dataclass(frozen=True, slots=True)
 class Course:
-    """The frames that an array's onsets were taken from: when each one was, and how loud.
+    """Time and power of the frames from which the onsets of an array were computed.
 
     Parameters
     ----------
     frame_indices : (F,) int64
-        Ascending; those of a site's arrays count from one origin.
+        Frame indices in ascending order. All arrays of a site count from the same origin.
     powers : (F,) float64
-        In-band mean power, full scale squared.
+        In-band mean power of each frame, full scale squared.
     begin : int
-        Frame index from which on the sound is active; the frames before it are its pre-roll.
+        First frame index at which the sound is active; earlier frames are its pre-roll.
     """
 
     frame_indices: IntArray
@@ -47,25 +47,26 @@ class Sound:
     Parameters
     ----------
     segments : sequence of (K, n) float32
-        Pieces of the active sound without gaps, at least one unless `onsets` are given; channels in the order of the
-        array's microphones.
+        Samples of each stretch of active sound without a gap; at least one stretch unless `onsets` are given. The
+        channels are in the order of the array's microphones.
     sample_rate_hz : float
     onsets : sequence of OnsetGCC
-        What the estimator's `onset_front_end` made of the frames of the sound and of its pre-roll, one value a frame;
-        empty if the estimator has no such front end.
+        Results of the estimator's `onset_front_end`, one for each frame of the sound and of its pre-roll; empty if the
+        estimator has no such front end.
     suspect : bool
         Whether the array was an outlier in many of the last events.
     sources : int
-        Most sources to look for.
+        Largest number of sources to look for.
     ended : bool
-        Whether the sound is complete. While it goes on it will be located again anyway, so an estimator
-        can skip its slower second look.
+        Whether the sound is complete. A sound that continues will be located again anyway, so an estimator can skip
+        its slower second look at it.
     detected : bool
-        Whether the array detected the sound by itself; if not, its frames were requested.
+        Whether the array detected the sound by itself. If it did not, its frames were requested.
     course : Course or None
-        The frames of `onsets`, one for each; None if unknown.
+        Time and power of the frames of `onsets`; None if they are unknown.
     second_looks : bool
-        Whether there is time to locate a doubtful sound again by other evidence; not on a server that is overloaded.
+        Whether there is time for a second look, which locates an unsure event again from other evidence; False while a
+        server is overloaded.
     """
 
     segments: Sequence[Float32Array]
@@ -86,7 +87,7 @@ class Sound:
     def without_dead_channels(self, gcc: GCC) -> GCC:
         """Return `gcc` with zeros in the pairs of dead microphones (`livessl.core.correlate.band.dead_channels`).
 
-        Without segments dead microphones cannot be recognized, and `gcc` is returned as it is.
+        Dead microphones are recognized in the segments. Without segments, `gcc` is returned unchanged.
         """
         if not self.segments:
             return gcc
@@ -98,7 +99,7 @@ class Sound:
 
 
 def strongest_onsets(sounds: Mapping[str, Sound], most: int) -> dict[str, Sound]:
-    """Return the sounds with the strongest onsets, at most `most`, in the order of the arrays' names."""
+    """Return the sounds of at most `most` arrays, those with the strongest onsets, in the order of their names."""
     in_order = {name: sounds[name] for name in sorted(sounds)}
     if len(in_order) <= most:
         return in_order
@@ -115,31 +116,32 @@ class Localization:
     position_m : (3,) float64
         Metres, room corner at the origin.
     covariance_m2 : (3, 3) float64
-        Square metres. Fusion reports only a direction if it is large compared with the distance to the nearest array.
+        Square metres. If it is large compared with the distance to the nearest array, fusion reports only a direction.
     confidence : float
         0 to 1.
     evidence : tuple of Evidence
-        One for each array, in the order of their names; power maps are drawn from it. May be empty.
+        One item for each array, in the order of the arrays' names. Power maps are drawn from the evidence. May be
+        empty.
     features : ConfidenceFeatures or None
-        What the confidence was computed from; None if it is no probability.
+        Quantities from which the confidence was computed; None if the confidence is not a probability.
     refused : str or None
-        Why the position should not be relied on, in words; None if the position can be relied on.
+        Reason, in words, not to rely on the position; None if the position can be relied on.
     outliers : mapping of str to float, or None
-        Arrays that disagree with the others and were left out of the position, and the angle in degrees between each
-        one's own direction and the position. None if the estimator does not look for outliers.
+        Arrays that disagree with the others and were excluded from the position; for each, the angle in degrees between
+        the direction it measured and the direction to the position. None if the estimator does not look for outliers.
     unneeded : collection of str
-        Arrays that were not used: their sound does not stand out from their own noise
-        (`livessl.core.locate.contributing`), or enough others have stronger onsets.
+        Arrays that were not used, because their sound does not stand out from their own noise
+        (`livessl.core.locate.contributing`), or because enough other arrays have stronger onsets.
     others : tuple of Localization
         Further sources that sounded at the same time.
     candidates : tuple of Candidate
-        The position, and then the places that explain the sound about as well, most probable first; empty if there are
-        none. With candidates, fusion reports at most a direction.
+        The position, and then the places that explain the sound about as well, most probable first; empty if no other
+        place does. If there are candidates, fusion reports at most a direction.
     ambiguity : str or None
-        Why there are candidates, in words; None without them.
+        Reason, in words, for the candidates; None without candidates.
     power : float or None
-        Greatest in-band mean power of a frame that the source has, full scale squared. None if all power is its own or,
-        for one of `others`, if its share is unknown.
+        Highest in-band mean frame power attributed to this source, full scale squared. None if it is the only source,
+        or if the share of one of `others` is unknown.
     """
 
     position_m: FloatArray
@@ -163,11 +165,11 @@ class PowerMaps:
     Parameters
     ----------
     grid : Grid
-        It may be coarser than the grid that is searched.
+        Grid of the maps, which may be coarser than the grid of the search.
     fused : (G,) float32
-        Sum over the arrays, in the grid's order.
+        Sum of the maps of all arrays, in the grid's order.
     arrays : mapping of str to (G,) float32
-        Maps of single arrays.
+        Maps of single arrays, by name.
     """
 
     grid: Grid
@@ -178,19 +180,19 @@ class PowerMaps:
 class Estimator(Protocol):
     """The interface of a localization method, as fusion uses it.
 
-    Only `locate` must do work, live and offline. `prepare` may do nothing (it is called live, when a node connects),
-    `onset_front_end` may return None, and `power_maps` is called only when a client requests a map. An estimator
-    may cache, but must give the same answer to the same sounds, and must not depend on their order.
+    Only `locate` has to be implemented. `prepare`, which is called in live operation when a node connects, may do
+    nothing; `onset_front_end` may return None; and `power_maps` is called only when a client requests a map. An
+    estimator may use caches, but must return the same result for the same sounds, in whatever order they come.
 
     Calls come from one thread, with two exceptions: `onset_front_end` may be called for several arrays at once, and
     `power_maps` from another thread.
     """
 
     name: str
-    """Name of the method, reported with every event; `create` sets it to the name in the registry."""
+    """Name of the method, which every event reports; `create` sets it to the name in the registry."""
 
     def prepare(self, array: str, sample_rate_hz: float) -> None:
-        """Compute what depends on an array's sampling rate, so that its first sound is not delayed.
+        """Compute tables that depend on an array's sampling rate, so that its first sound is not delayed.
 
         Raises
         ------
@@ -200,9 +202,9 @@ class Estimator(Protocol):
         ...
 
     def onset_front_end(self, array: str, sample_rate_hz: float) -> OnsetFrontEnd | None:
-        """Return a new front end to which every frame of an array is passed in order, or None if segments suffice.
+        """Return a new front end that gets every frame of an array in order; None if the segments of sounds suffice.
 
-        What it returns for the frames of a sound becomes `Sound.onsets`.
+        The results of the front end for the frames of a sound become `Sound.onsets`.
         """
         ...
 
@@ -217,18 +219,18 @@ class Estimator(Protocol):
         ----------
         evidence : sequence of Evidence
         separately : collection of str, or None
-            Arrays of which single maps are wanted besides the fused map; None for all.
+            Names of the arrays whose own maps are computed in addition to the fused map; None for all arrays.
         """
         ...
 
 
 Factory = Callable[[Sequence[ArraySpec], Grid, float], Estimator]
-"""Makes an estimator from the arrays, the search grid and the speed of sound in m/s. A class whose constructor takes
-these parameters is itself a factory."""
+"""A function that makes an estimator from the arrays, the search grid and the speed of sound in m/s. A class whose
+constructor takes these parameters is itself a factory."""
 
 
 def register(name: str, factory: Factory) -> None:
-    """Add a localization method, which can then be chosen wherever a method is named. An existing name is replaced.
+    """Add a localization method, which can then be chosen by its name. A method that has this name is replaced.
 
     Parameters
     ----------
@@ -269,7 +271,7 @@ def create(method: str, arrays: Sequence[ArraySpec], grid: Grid, c_m_s: float) -
     Raises
     ------
     ValueError
-        If there is no method of that name, or its factory cannot be imported.
+        If no method has that name, or the factory of the method cannot be imported.
     """
     if not is_method(method):
         raise ValueError(unknown_method(method))
@@ -287,7 +289,7 @@ def _imported(path: str) -> Factory:
         factory: Any = import_module(module)
     except ImportError as error:
         raise ValueError(
-            f"cannot import {module!r} for {path!r} ({error}); install it, or start in the folder that holds it"
+            f"cannot import {module!r} for {path!r} ({error}); install it, or run the command in its folder"
         ) from error
     try:
         for name in attribute.split("."):

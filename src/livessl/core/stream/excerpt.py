@@ -49,7 +49,7 @@ class Sounds(Mapping[str, Sound]):
     ended : bool
         Whether the sound has ended, so that each array's sound is complete.
     second_looks : bool
-        Whether there is time to locate a doubtful sound again.
+        Whether there is time to locate an unsure event a second time.
     """
 
     def __init__(

@@ -1,13 +1,13 @@
-"""The life of an event, from its first active frame until it has been reported. It locates nothing.
+"""Keeps the state of an event from its first active frame until it is reported. It locates nothing.
 
 Its states are these.
 
 | state | entered when | next state |
 |---|---|---|
-| `OPEN` | a frame index with an active frame closes | `ENDED`; `REPORTED` if it is cut short |
-| `ENDED` | the sound was quiet for a hang-over, or has reached the greatest length | `AWAITING_BACKFILL`, `REPORTED` |
+| `OPEN` | a frame index with an active frame closes | `ENDED`; `REPORTED` if the event is cut short |
+| `ENDED` | the sound was quiet for a hang-over, or the event became too long | `AWAITING_BACKFILL`, `REPORTED` |
 | `AWAITING_BACKFILL` | frames were requested from arrays that did not detect the sound | `REPORTED` |
-| `REPORTED` | its results were handed over, or are left to another pass | none |
+| `REPORTED` | the results were handed over, or another pass will make them | none |
 
 An event is cut short if no more frames come: at the end of a recording, before a gap, when all arrays are silent, and
 when the server's clock is set back.
@@ -43,7 +43,7 @@ _PREDECESSORS: Final[Mapping[EventState, frozenset[EventState]]] = {
 
 @dataclass(slots=True)
 class RequestedFrames:
-    """The frames that were requested from one array, and those that have come. Frame indices are joint ones."""
+    """The frames that were requested from one array, and those that have arrived. Frame indices are joint ones."""
 
     span: range
     frames: dict[int, Frame] = field(default_factory=dict)
@@ -55,7 +55,7 @@ class RequestedFrames:
 
     @property
     def is_complete(self) -> bool:
-        """True once the last one has come, and with it all, because frames come in order."""
+        """True once the last requested frame has arrived; frames arrive in order, so all others came before it."""
         return self.span[-1] in self.frames
 
 
@@ -73,14 +73,14 @@ class PendingEvent:
         self.start = start
         self.last_active = start
         self.closed = start
-        """The last frame index that was closed in it; frames beyond it are no part of the event."""
+        """The last frame index that was closed; later frames do not belong to the event."""
         self.became_quiet = False
-        """True if it ended with a quiet hang-over, not by its length."""
+        """True if the event ended with a quiet hang-over, not by its length."""
         self.late_frames = 0
         self.excerpt: Excerpt | None = None
-        """Sound from which it was located; None before it is located, and if another pass reports it."""
+        """Sound from which the event was located; None before that, and if another pass reports the event."""
         self.results: Sequence[Event] = ()
-        """Its results, one for each source; empty before it is located, and if another pass reports it."""
+        """Results, one for each source; empty before the event is located, and if another pass reports the event."""
         self.requested: Mapping[str, RequestedFrames] = {}
         self.requested_ns = 0
 
@@ -91,7 +91,7 @@ class PendingEvent:
 
     @property
     def length(self) -> int:
-        """Number of frame indices from its start to the last one that was closed."""
+        """Number of frame indices from the start of the event to the last closed one."""
         return self.closed - self.start + 1
 
     @property
@@ -115,7 +115,7 @@ class PendingEvent:
         self.became_quiet = became_quiet
 
     def set_results(self, results: Sequence[Event], excerpt: Excerpt | None) -> None:
-        """Set its results and the excerpt that they were located from."""
+        """Set the results, and the excerpt from which they were located."""
         self.results, self.excerpt = results, excerpt
 
     def await_backfill(self, requested: Mapping[str, RequestedFrames], now_ns: int) -> None:

@@ -24,7 +24,9 @@ class DeadLetters:
         Has the deliverers look for new deliveries.
     """
 
-    def __init__(self, in_force: Callable[[], AlertsInForce], clock: Clock, wake_deliverers: Callable[[], None]) -> None:
+    def __init__(
+        self, in_force: Callable[[], AlertsInForce], clock: Clock, wake_deliverers: Callable[[], None]
+    ) -> None:
         self._in_force = in_force
         self._clock = clock
         self._wake_deliverers = wake_deliverers

@@ -1,4 +1,4 @@
-"""REST route that says how to turn a camera towards a place or an event."""
+"""The REST route `GET point`: the pan and tilt by which a camera faces a position or an event."""
 
 from __future__ import annotations
 
@@ -18,29 +18,29 @@ from livessl.server.api.routes import as_json
 from livessl.server.parts import Parts
 
 MAX_M: Final = 1e6
-"""Largest coordinate of a place, in metres, as in the site file."""
+"""Largest coordinate of a position, in metres; the site file has the same limit."""
 
 LEAST_M: Final = 1e-3
-"""Least distance, in metres, at which a place has a direction from the camera."""
+"""Least distance, in metres, of a position from the camera; a nearer one has no direction."""
 
 _NOT_FOUND: Final = "There is no camera of that name, or no event of that id."
 _NO_PLACE: Final = "The event was not located."
 
 
 class Pointing(BaseModel):
-    """The direction in which a camera has to be turned towards a place."""
+    """The direction in which a camera faces a position."""
 
     v: Version
     camera: str = Field(description="Name of the camera in the site file.", examples=["door"])
-    event_id: str | None = Field(description="Id of the event; null for a place.", examples=["lab-1"])
+    event_id: str | None = Field(description="Id of the event; null for a given position.", examples=["lab-1"])
     position_m: PositionM
-    pan_deg: float = Field(ge=-180, le=180, description="Degrees to the right of where it looks at rest.")
+    pan_deg: float = Field(ge=-180, le=180, description="Degrees to the right of the camera's direction at rest.")
     tilt_deg: float = Field(ge=-90, le=90, description="Degrees upwards.")
-    distance_m: float = Field(gt=0, description="Distance of the place from the camera, metres.")
+    distance_m: float = Field(gt=0, description="Distance between the position and the camera, in metres.")
 
 
 def point_route(parts: Parts) -> APIRouter:
-    """Pan and tilt of a camera."""
+    """Return the router with `GET point`."""
     cameras, router = parts.site.cameras, APIRouter()
 
     @router.get(
@@ -53,10 +53,11 @@ def point_route(parts: Parts) -> APIRouter:
         camera: Annotated[str, Query(description="name of the camera in the site file")],
         event: Annotated[str | None, Query(description="id of the event to point at")] = None,
         position_m: Annotated[
-            str | None, Query(description="or the place, x,y,z in metres", examples=["2.1,3.4,1.2"])
+            str | None,
+            Query(description="position to point at instead of an event: x,y,z in metres", examples=["2.1,3.4,1.2"]),
         ] = None,
     ) -> Response:
-        """Pan and tilt that turn a camera towards an event, or a place."""
+        """Pan and tilt by which a camera faces an event or a position."""
         if camera not in cameras:
             raise HTTPException(404, f"no camera {camera!r}; cameras are {', '.join(cameras) or 'none: add cameras'}")
         if (event is None) == (position_m is None):

@@ -1,6 +1,6 @@
-"""The only reader of `clip.json`, the file about the recordings of an event.
+"""Reads and checks `clip.json`, the file that describes the recordings of an event. No other module reads it.
 
-Nothing in it is relied on before it is checked: another release may have written it, or a disk damaged it.
+All fields are checked before use, because another release may have written the file, or a disk may have damaged it.
 """
 
 from __future__ import annotations
