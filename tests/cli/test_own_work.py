@@ -86,7 +86,7 @@ def test_simulate_refuses_files_of_others(run: Run, recorded: Recorded, tmp_path
     (tmp_path / name).write_bytes(b"a: 1  # precious\n")
     done = run(*simulate_arguments(recorded.site, tmp_path))
     assert (done.code, "name another" in done.err) == (2, True)
-    assert f"{tmp_path / name}, which is of no complete simulated session" in done.err
+    assert f"{tmp_path / name}, which does not belong to a complete simulated session" in done.err
     assert contents(tmp_path) == {name: b"a: 1  # precious\n"}
 
 

@@ -1,11 +1,12 @@
 """The process that owns a node's audio device: `python -m livessl.capture.device_main WANTED FDS`.
 
-Libraries of audio devices loop for ever, hang and flood when a device is unplugged. Here they can be killed. The
-process loads as little as possible: no numpy, no other room of livessl. It ends when its standard input does, so it
-never outlives the node. The node reads its standard output and error, which belong to the native libraries.
+Libraries of audio devices may loop endlessly, hang or flood the log when a device is unplugged. In a process of their
+own they can be killed. The process imports as little as possible: neither numpy nor other packages of livessl. It ends
+when its standard input is closed, so it never outlives the node. Its standard output and error belong to the native
+libraries, and the node reads both.
 
-Real-time contract: PortAudio calls `Receiver.receive` on a thread of its own. The method copies the block into the
-shared memory, stamps it, publishes it and returns. It does not wait, takes no lock of ours and does not log. Only that
+Real-time contract: PortAudio calls `Receiver.receive` on its own thread. The method copies the block into the shared
+memory, stamps it, publishes it and returns. It does not wait, takes no lock of livessl and does not log. Only that
 thread writes the attributes of `Receiver`.
 """
 
@@ -25,18 +26,18 @@ from livessl.capture.ring import RingWriter
 from livessl.clock import Clock, SystemClock
 
 BEAT_S: Final = 0.1
-"""Interval of the main loop, in seconds. Each turn is a sign of life in the ring."""
+"""Interval of the main loop, in seconds. Each pass of the loop leaves a sign of life in the ring."""
 
 REOPEN_S: Final = 0.8
-"""Time between two attempts to open a missing device, in seconds. A scan of all devices can take some tenths of a
-second."""
+"""Time between two attempts to open a missing device, in seconds. A scan of all devices can take a few tenths of
+a second."""
 
 CLOSING_S: Final = 0.3
-"""Longest time, in seconds, in which the library may close the device when the node ends."""
+"""Longest time, in seconds, that the library may take to close the device when the node ends."""
 
 MAX_BACKLOG_S: Final = 1.0
 """Largest plausible age of samples beyond the length of a block and of the driver's buffer, in seconds. A conversion
-time beyond it is ignored."""
+time that makes samples older is ignored."""
 
 
 class Receiver:
@@ -46,12 +47,12 @@ class Receiver:
     ----------
     ring : RingWriter
     clock : Clock
-        Stamps the blocks.
+        Clock by which blocks are stamped.
     sample_rate_hz : float
     is_hardware : bool
-        Whether conversion times of the driver are to be trusted.
+        Whether the conversion times of the driver can be trusted.
     latency_s : float
-        Length of the driver's buffer, in seconds: samples in it may be that old.
+        Length of the driver's buffer, in seconds. Samples in the buffer may be that old.
     """
 
     def __init__(
@@ -66,14 +67,15 @@ class Receiver:
         self._lost = False
 
     def receive(self, samples: Any, count: int, time: Any, status: Any) -> None:
-        """Take in a block: PortAudio's callback, see the contract at the head of the module.
+        """Take in a block. PortAudio calls this method; the contract is at the head of the module.
 
         A block that the driver flags is dropped whole, because in PortAudio 19.6 the gap lies inside it.
 
-        The driver of a hardware device counts the samples in its buffer, so its conversion time includes how long they
-        waited for this call, also when two blocks of one period come at once. The conversion time of a sound server is
-        a guess: PulseAudio's drifts by 0.2 s in the first second while its blocks arrive evenly. For a sound server,
-        and if the time is not plausible, the last sample is taken to have arrived now.
+        The driver of a hardware device counts the samples in its buffer. Its conversion time therefore includes the
+        time for which they waited for this call, even if two blocks of one period arrive at once. The conversion time
+        of a sound server is a guess: that of PulseAudio drifts by 0.2 s in the first second while its blocks arrive
+        evenly. For a sound server, and if the conversion time is not plausible, the last sample counts as having
+        arrived now.
         """
         first_index = self._next_index
         self._next_index = first_index + count
@@ -90,7 +92,7 @@ class Receiver:
 
 
 class _Reporter:
-    """Writes changes of the state for the node."""
+    """Writes changes of the device's state to the node."""
 
     def __init__(self, report_fd: int) -> None:
         self._fd = report_fd
@@ -103,7 +105,7 @@ class _Reporter:
 
 
 def run(wanted: Wanted, ring: RingWriter, reporter: _Reporter, ended: threading.Event) -> None:
-    """Open the device as soon as that is possible, and watch its stream until it stops or the node ends."""
+    """Open the device as soon as possible, and watch its stream until the stream stops or the node ends."""
     clock = SystemClock()
 
     def callback(device: Any) -> Any:
@@ -120,7 +122,7 @@ def run(wanted: Wanted, ring: RingWriter, reporter: _Reporter, ended: threading.
         try:
             if sd is None:
                 sd = library()
-                not_realtime = request_realtime()  # the library has started its helpers, and not yet its threads
+                not_realtime = request_realtime()  # the library has started its helper processes, but not its threads
             else:
                 rescan(sd)
             stream, is_hardware = open_stream(sd, wanted, callback)
@@ -148,16 +150,16 @@ def _fail(kind: type[BaseException], error: BaseException, trace: TracebackType 
 
 
 def main() -> None:
-    """Run the process; it never returns, because the library's own clean-up may hang."""
+    """Run the process. The function never returns, because the library's own clean-up may hang."""
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)  # the node decides, and it also receives Ctrl-C
+        signal.signal(number, signal.SIG_IGN)  # the node also receives Ctrl-C, and decides when this process ends
     sys.excepthook = _fail
     wanted = Wanted.from_json(sys.argv[1])
     memory_fd, published_fd, report_fd = map(int, sys.argv[2].split(","))
     ended = threading.Event()
 
     def watch() -> None:
-        while os.read(0, 1):  # nothing is ever written to it; it ends when the node does, however that happens
+        while os.read(0, 1):  # the node never writes to it; it is closed when the node ends, for whatever reason
             pass
         ended.set()
         threading.Event().wait(CLOSING_S)

@@ -10,7 +10,7 @@ from livessl.capture.device_report import DeviceState, Report
 from livessl.capture.realtime import LONGEST_S
 
 START_NOTICE_S: Final = 1.5
-"""Time in seconds without a first report after which the problem says so."""
+"""Time, in seconds, without a first report after which the problem mentions that there is none."""
 
 START_S: Final = 15.0
 """Time in seconds that the process may take until its first report; slow machines load the library for seconds."""

@@ -1,6 +1,7 @@
-"""Reads whether this machine's clock follows another one: from chrony or systemd-timesyncd, else from the kernel.
+"""Finds out whether this machine's clock is synchronized: from chrony or systemd-timesyncd, otherwise from the kernel.
 
-The kernel's account always exists on Linux. PTP programs set it as well, so it covers clocks that follow PTP.
+On Linux, the kernel always has a state of its clock. Programs for PTP set it as well, so it also covers clocks that are
+synchronized by PTP.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ COMMAND_S: Final = 3.0
 """Longest wait for an answer of a time service, in seconds."""
 
 _UNSYNC: Final = 0x0040
-"""Status bit of adjtimex: the clock follows no other."""
+"""Status bit of adjtimex for a clock that is not synchronized."""
 
 _ERROR: Final = 5
 """Result of adjtimex for a clock that is not synchronized."""
@@ -25,10 +26,10 @@ _CHRONY_FIELDS: Final = 14
 """Number of fields that `chronyc -c tracking` prints."""
 
 _CHRONY_UNSYNC: Final = ("Not synchronised", "Not synchronized")
-"""Last field of a clock that follows no other, as different versions spell it."""
+"""Last field for a clock that is not synchronized, in the spellings of different versions."""
 
 Command = Callable[[tuple[str, ...]], str | None]
-"""Runs a program and returns what it prints; None if it is not installed or fails."""
+"""A function that runs a program and returns its output; None if the program is not installed or fails."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,14 +77,14 @@ class _Timex(ctypes.Structure):
 
 
 def read_host_clock(run: Command | None = None, kernel: Callable[[], HostClock] | None = None) -> HostClock:
-    """Return the state of this machine's clock, from the best source that answers.
+    """Return the state of this machine's clock from the best source that is available.
 
     Parameters
     ----------
     run : callable or None
-        Runs the programs of time services; None for real ones.
+        Runs the programs of time services; None runs the real ones.
     kernel : callable or None
-        Reads the kernel's account; None for the real one.
+        Returns the kernel's state of the clock; None for the real one.
     """
     run = run_command if run is None else run
     tracking = run(("chronyc", "-n", "-c", "tracking"))
@@ -97,7 +98,7 @@ def read_host_clock(run: Command | None = None, kernel: Callable[[], HostClock] 
 
 
 def kernel_clock() -> HostClock:
-    """Return the kernel's account of its clock; nothing is known on a system that is not Linux."""
+    """Return the kernel's state of its clock; all fields are unknown on a system that is not Linux."""
     try:
         adjtimex = ctypes.CDLL(None, use_errno=True).adjtimex
     except (OSError, AttributeError):
@@ -108,15 +109,16 @@ def kernel_clock() -> HostClock:
 
 
 def from_kernel(result: int, status: int, maxerror_us: int) -> HostClock:
-    """Return the state of the clock from what adjtimex returns, its status and its greatest error in microseconds."""
+    """Return the state of the clock from the result of adjtimex, its status, and its greatest error in microseconds."""
     synchronized = result != _ERROR and not status & _UNSYNC
     return HostClock(synchronized, "kernel", error_s=maxerror_us / 1e6 if synchronized else None)
 
 
 def from_chrony(tracking: str) -> HostClock | None:
-    """Return the state of the clock from what `chronyc -c tracking` prints; None if it cannot be read.
+    """Return the state of the clock from the output of `chronyc -c tracking`; None if the output cannot be read.
 
-    The error is the present correction, half the delay to the reference clock and its dispersion, as in RFC 5905.
+    The error is the sum of the present correction, half the delay to the reference clock, and its dispersion, as in RFC
+    5905.
     """
     fields = tracking.strip().split(",")
     if len(fields) < _CHRONY_FIELDS:
@@ -133,7 +135,7 @@ def from_chrony(tracking: str) -> HostClock | None:
 
 
 def run_command(command: tuple[str, ...]) -> str | None:
-    """Run a program and return what it prints; None if it is not installed, fails, or takes longer than 3 s."""
+    """Run a program and return its output; None if it is not installed, fails, or takes longer than `COMMAND_S`."""
     program = shutil.which(command[0])
     if program is None:
         return None
@@ -147,5 +149,5 @@ def run_command(command: tuple[str, ...]) -> str | None:
 
 
 def _properties(text: str) -> Mapping[str, str]:
-    """Return the lines KEY=VALUE of a text."""
+    """Return the values of the lines KEY=VALUE of a text, by key."""
     return dict(line.split("=", 1) for line in text.splitlines() if "=" in line)

@@ -1,4 +1,4 @@
-"""Recording of an audio device to a session."""
+"""Records an audio device to a session."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _log = logging.getLogger(__name__)
 
 
 def record_device(recorder: Recorder, device: Device, over: Callable[[], bool]) -> None:
-    """Record a device until `over()`; problems of the device are logged."""
+    """Record a device until `over` returns True; problems of the device are logged."""
     problem = None
     with device, recorder:
         for block in device:

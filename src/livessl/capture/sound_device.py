@@ -1,6 +1,6 @@
 """An audio interface as an iterator of blocks, through a process of its own that is watched, killed and restarted.
 
-PortAudio's thread may loop for ever, hang, or print without end when a device is unplugged, and nothing within the
+PortAudio's thread may loop or print endlessly, or hang, when a device is unplugged, and nothing within the
 same process can stop it. The node therefore never loads the library (see `device_main`).
 """
 

@@ -23,10 +23,10 @@ from livessl.lab.evaluate.scenarios import HALVES, LOCALIZER, NOISE, ROOMS, SCEN
 from livessl.site.load import load_site
 
 REPORT: Final = "report"
-"""Name of the experiment that simulates nothing and reports the results of earlier ones."""
+"""Name of the experiment that simulates nothing, and reports the results of earlier runs."""
 
 ALONE: Final = (NOISE, *SESSIONS)
-"""Scenarios of the localizer that are campaigns of their own."""
+"""Scenarios of the localizer that cannot be combined with others."""
 
 
 def add_arguments(parser: Any) -> None:
@@ -35,12 +35,27 @@ def add_arguments(parser: Any) -> None:
     add(
         "experiment",
         choices=[*sorted(EXPERIMENTS), LOCALIZER, REPORT],
-        help=f"experiment of the paper; {LOCALIZER} compares the methods onset and srp-phat; {REPORT} runs nothing: it "
-        "reports on the folders of --with",
+        help=f"diversity, office and one-array repeat experiments of the paper; {LOCALIZER} compares the methods onset "
+        f"and srp-phat; {REPORT} simulates nothing, and writes one report on the folders given by --with",
     )
-    add("--site", type=Path, help="site file whose room and arrays replace the paper's; for one-array and diversity")
-    add("--events", type=Path, metavar="DIR", help="folder of sounds to play, named like doorslam001.wav")
-    add("--out", type=Path, required=True, metavar="DIR", help="folder for the results; an interrupted run resumes")
+    add(
+        "--site",
+        type=Path,
+        help="site file whose room and arrays replace those of the paper (only with one-array and diversity)",
+    )
+    add(
+        "--events",
+        type=Path,
+        metavar="DIR",
+        help="folder of sounds; each file is named by class and number, such as doorslam001.wav",
+    )
+    add(
+        "--out",
+        type=Path,
+        required=True,
+        metavar="DIR",
+        help="folder for the results; the same command resumes an interrupted run",
+    )
     add(
         "--with",
         dest="others",
@@ -48,11 +63,15 @@ def add_arguments(parser: Any) -> None:
         type=Path,
         default=[],
         metavar="DIR",
-        help="results folder (`--out`) of another experiment to include in the report; repeatable",
+        help="folder of results (--out of another run) to include in the report; repeat the option for each folder",
     )
     add("--jobs", type=argument.positive, help="number of parallel processes (default: one per core)")
-    add("--scheduler", metavar="tcp://…", help="Dask scheduler to use instead of local processes")
-    add_json(parser, "print the paths of the files written as one JSON object")
+    add(
+        "--scheduler",
+        metavar="tcp://…",
+        help="address of a Dask scheduler, which then runs the work instead of local processes",
+    )
+    add_json(parser, "print the paths of the written files as one JSON object")
     _add_simulation(parser.add_argument_group("simulation"))
     _add_localization(parser.add_argument_group("localization"))
     _add_comparison(parser.add_argument_group(f"with {LOCALIZER}"))
@@ -60,35 +79,55 @@ def add_arguments(parser: Any) -> None:
 
 def _add_simulation(group: Any) -> None:
     add = group.add_argument
-    add("--positions", type=argument.positive, metavar="N", help="source positions (default: as many as in the paper)")
+    add(
+        "--positions",
+        type=argument.positive,
+        metavar="N",
+        help="number of source positions (default: the number in the paper)",
+    )
     add("--rt", metavar="S,S,…", help="reverberation times in seconds, such as 0,0.4, or a range such as 0:2:0.2")
     add("--seed", type=argument.seed, default=0, help="random seed; the same seed gives the same results (default 0)")
-    add("--classes", default=",".join(CLASSES), help=f"classes of sounds (default {','.join(CLASSES)})")
+    add("--classes", default=",".join(CLASSES), help=f"classes of sounds to use (default {','.join(CLASSES)})")
     add(
         "--snr",
         metavar="DB[,DB…]",
-        help="signal-to-noise ratio: white sensor noise, this many dB below each recording's mean power; inf for no "
-        f"noise (default: no noise); only {LOCALIZER} takes several",
+        help="signal-to-noise ratio in dB: mean power of each recording over that of white sensor noise; inf adds no "
+        f"noise (default: inf); only {LOCALIZER} accepts several values",
     )
-    add("--sample-rate", type=argument.positive, default=16000, metavar="HZ", help="sampling rate (default 16000)")
+    add(
+        "--sample-rate",
+        type=argument.positive,
+        default=16000,
+        metavar="HZ",
+        help="sampling rate in hertz (default 16000)",
+    )
 
 
 def _add_localization(group: Any) -> None:
     add = group.add_argument
-    add("--grid", type=float, metavar="M", help="spacing of the search grid (default: the paper's)")
-    add("--segment", choices=("longest", "peak"), default="longest", help="segment to localize (default longest)")
-    add("--no-band-limit", action="store_true", help="use the full band, even where it causes spatial aliasing")
+    add("--grid", type=float, metavar="M", help="spacing of the search grid in metres (default: that of the paper)")
+    add(
+        "--segment",
+        choices=("longest", "peak"),
+        default="longest",
+        help="segment of each sound to locate: the longest, or the one with the peak (default longest)",
+    )
+    add(
+        "--no-band-limit",
+        action="store_true",
+        help="use the full band for all pairs, even if it causes spatial aliasing",
+    )
 
 
 def _add_comparison(group: Any) -> None:
     add = group.add_argument
-    add("--half", choices=HALVES, default="test", help="which half of the sounds to play (default test)")
+    add("--half", choices=HALVES, default="test", help="half of the sounds to use (default test)")
     add(
         "--scenario",
         default=ROOMS,
         metavar="NAME[,NAME…]",
-        help=f"one or more of {', '.join(SCENARIOS)}, which share sounds and rooms (default {ROOMS}); "
-        f"or one of {', '.join(ALONE)} alone",
+        help=f"one or more of {', '.join(SCENARIOS)}, compared on the same sounds and rooms (default {ROOMS}); "
+        f"or only one of {', '.join(ALONE)}",
     )
 
 

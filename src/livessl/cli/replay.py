@@ -1,4 +1,4 @@
-"""`livessl replay`: play a recorded session to a running server, or to one in this process."""
+"""`livessl replay`: plays a recorded session to a running server, or to a server in this process."""
 
 from __future__ import annotations
 
@@ -33,15 +33,18 @@ def add_arguments(parser: Any) -> None:
         type=Path,
         metavar="DIR",
         nargs="+",
-        help="session folders made by record or simulate; one for each node",
+        help="folder of a session, made by record or simulate; give one folder for each node",
     )
-    parser.add_argument("--site", type=Path, help="site file (default: the session's own)")
-    parser.add_argument("--speed", type=argument.speed, default=1.0, help="multiple of real time, or 'max' (default 1)")
+    parser.add_argument("--site", type=Path, help="site file (default: that of the first session)")
+    parser.add_argument(
+        "--speed", type=argument.speed, default=1.0, help="speed as a multiple of real time, or 'max' (default 1)"
+    )
     parser.add_argument(
         "--server",
         type=argument.endpoint,
         metavar="ENDPOINT",
-        help="running server to play to, such as tcp://127.0.0.1:5570 (default: a server in this process)",
+        help="address for nodes of the running server that gets the session, such as tcp://127.0.0.1:5570 (default: a "
+        "server in this process)",
     )
     parser.add_argument(
         "--once", action="store_true", help="exit at the end of the session instead of keeping the dashboard running"

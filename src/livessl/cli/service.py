@@ -1,4 +1,4 @@
-"""The service manager of a command that runs for ever."""
+"""Returns the service manager of a command that runs until it is stopped."""
 
 from __future__ import annotations
 

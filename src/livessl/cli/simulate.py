@@ -1,4 +1,4 @@
-"""`livessl simulate`: write what the arrays of a site would record of a scene, as a session."""
+"""`livessl simulate`: simulates a scene in the site's room, and writes the recordings of the arrays as a session."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ def add_arguments(parser: Any) -> None:
         type=Path,
         required=True,
         metavar="DIR",
-        help="folder for the session: new, empty, or with a simulated session, which is replaced",
+        help="folder for the session; it must be new, empty, or contain a simulated session, which is replaced",
     )
     parser.add_argument("--count", type=argument.positive, default=8, help="number of sounds in the scene (default 8)")
     parser.add_argument(
         "--sample-rate",
         type=argument.sample_rate,
         metavar="HZ",
-        help="sampling rate of the recordings (default: that of each node's device in the site file, else 44100)",
+        help="sampling rate of the recordings (default: the rate of each node's device, otherwise 44100)",
     )
     parser.add_argument(
         "--seed", type=argument.seed, default=0, help="random seed; the same seed gives the same session (default 0)"
@@ -62,7 +62,7 @@ def run(arguments: argparse.Namespace) -> int:
     if (arguments.out / SESSION_FILE).exists() and not (arguments.out / TRUTH_FILE).exists():
         raise ConfigError([Fault(f"--out {arguments.out}", "holds a recorded session; choose another folder")])
     option, own = f"--out {arguments.out}", simulated_files(arguments.out)
-    foreign = "which is of no complete simulated session"
+    foreign = "which does not belong to a complete simulated session"
     refuse_foreign(option, scene_files(arguments.out, site), own.__contains__, arguments.site, foreign)
     rates = {} if arguments.sample_rate else device_rates_hz(site)
     rate = float(arguments.sample_rate or max(rates.values(), default=DEFAULT_RATE_HZ))

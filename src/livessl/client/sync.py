@@ -48,8 +48,9 @@ def connect(url: str, token: str | None = None, **options: Unpack[Options]) -> C
 class Client:
     """A client of a server; iterate over it for live messages. One thread may do so, and any thread may `close`.
 
-    It connects again for ever. Every event that the server stores is delivered, and none twice; of other messages a
-    `Gap` says how many were lost. An event whose sound arrived late is delivered again, with its better answer.
+    It connects again until it is closed. Every event that the server stores is delivered, and none twice; of other
+    messages a `Gap` says how many were lost. An event whose sound arrived late is delivered again, with its better
+    answer.
 
     Parameters
     ----------

@@ -61,7 +61,7 @@ PATIENCE_S: Final = 10.0
 """Time, in seconds, for which a message waits for its predecessors."""
 
 DUPLICATES_S: Final = 600.0
-"""Time, in seconds, for which the stream recognizes a message that it has already; the archive does so for ever."""
+"""Time, in seconds, for which the stream recognizes a message that it already has; the archive always recognizes it."""
 
 LOOK_S: Final = 1.0
 """Interval, in seconds, at which a hub that waits for its turn looks whether another one takes messages in."""

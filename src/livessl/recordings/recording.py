@@ -213,7 +213,7 @@ def paced_blocks(recordings: Sequence[TimedRecording], clock: Clock) -> Iterator
 
 @dataclass(frozen=True)
 class LoopedRecording:
-    """A recording repeated for ever, without a gap between the repetitions."""
+    """A recording that is repeated without end, and without gaps between the repetitions."""
 
     once: Recording
     duration_s: float = float("inf")

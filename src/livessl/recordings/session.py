@@ -1,4 +1,4 @@
-"""A recorded session on disk: its files with their start times, and its site."""
+"""Reads and writes a recorded session: its recordings with their start times, and its site file."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ VERSION: Final = 1
 
 
 class Piece(BaseModel):
-    """One file of one array without gaps; its channels are in the order of the array's microphones."""
+    """One recording of one array, a file without gaps. Its channels are in the order of the array's microphones."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -40,7 +40,7 @@ class Piece(BaseModel):
 
     @property
     def start_ns(self) -> int:
-        """Site time of its first sample."""
+        """Site time of the first sample, nanoseconds."""
         return utc_ns(self.start_utc)
 
 
@@ -53,7 +53,7 @@ class _SessionFile(BaseModel):
 
 @dataclass(frozen=True)
 class Session:
-    """A folder with recordings and their site."""
+    """A folder with recordings and their site file."""
 
     directory: Path
     pieces: tuple[Piece, ...]
@@ -63,13 +63,13 @@ class Session:
         return self.directory / piece.file
 
     def site(self, joint: Mapping[str, Sequence[str]] | None = None) -> Site:
-        """Return the site of the recording, with the joint arrays of `joint` in addition to its own."""
+        """Return the site of the session, with the joint arrays of `joint` in addition to those of its site file."""
         return load_site(self.directory / SITE_FILE, joint)
 
     def inputs(self) -> dict[str, list[int]]:
-        """Return the inputs of the device that were recorded, by array, in the order of the channels of its files.
+        """Return the recorded inputs of the device for each array, in the order of the channels of its files.
 
-        Arrays without a node are left out, and all arrays if the session's site file cannot be read.
+        Arrays without a node are missing. If the site file of the session cannot be read, the result is empty.
         """
         try:
             data = read_yaml((self.directory / SITE_FILE).read_text(encoding="utf-8"))
@@ -90,7 +90,7 @@ def piece(array: str, file: str, start_ns: int) -> Piece:
 def write_session(directory: Path, site: Site, pieces: list[Piece]) -> None:
     """Write the session file and the site file into the folder of the recordings.
 
-    Older ones are replaced whole or not at all, so that a full disk and a sudden end leave a session that can be read.
+    Older files are replaced entirely or not at all, so that the session can be read even after a full disk or a crash.
     """
     described = _SessionFile(version=VERSION, pieces=pieces).model_dump()
     _replace(directory / SITE_FILE, site_text(site))
@@ -98,7 +98,7 @@ def write_session(directory: Path, site: Site, pieces: list[Piece]) -> None:
 
 
 def holds_copied_site(directory: Path) -> bool:
-    """Return whether the site file in a folder is a session's copy, and not one with comments or another layout."""
+    """Return whether the site file in a folder is the copy that a session has, without comments or another layout."""
     try:
         text = (directory / SITE_FILE).read_text(encoding="utf-8")
         return bool(text == _site_yaml(read_yaml(text)))
@@ -151,7 +151,7 @@ def read_session(directory: Path) -> Session:
 
 
 def site_text(site: Site) -> str:
-    """Return a site as YAML that needs no other files: positions are absolute, and keys and tokens are left out."""
+    """Return a site as YAML that needs no other files: with absolute positions, and without keys and tokens."""
     http = {"tokens", "certificate", "private_key"}
     data: dict[str, Any] = site.model_dump(
         mode="json", exclude_defaults=True, exclude={"keys": True, "calibration": True, "server": {"http": http}}

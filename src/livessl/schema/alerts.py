@@ -64,7 +64,7 @@ class Alert(Model):
 
     kind: Literal["alert"]
     key: str = Field(
-        description="Name of the alert for ever. Deliveries of one alert have the same key, however often they come.",
+        description="Permanent key of the alert. All deliveries of one alert have the same key.",
         examples=["alert_0f3c5b9d7e8a41c6a2b4d6e8f0a1b2c3"],
     )
     rule: RuleName

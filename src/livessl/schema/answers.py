@@ -100,7 +100,7 @@ class Privacy(Model):
 
     mode: PrivacyMode
     retention_days: float | None = Field(
-        gt=0, description="Days after which events are deleted; null keeps them for ever.", examples=[30.0]
+        gt=0, description="Days after which events are deleted; null if events are never deleted.", examples=[30.0]
     )
 
 

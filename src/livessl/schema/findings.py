@@ -31,7 +31,7 @@ class Finding(Model):
     )
     cure: str = Field(description="What to do.", examples=["exchange the plugs"])
     input: int | None = Field(
-        ge=1, description="Input of the device that carries the channel, where the site file says so.", examples=[7]
+        ge=1, description="Input of the device that carries the channel, if the site file names it.", examples=[7]
     )
 
 
@@ -45,7 +45,7 @@ class BlindSpot(Model):
     )
     arrays: list[str] = Field(
         min_length=1,
-        description="The array; several if the same fault of each of them would be hidden alike.",
+        description="Array; several if the same fault of each of them would stay hidden.",
         examples=[["north", "south"]],
     )
     least_m: float | None = Field(

@@ -87,7 +87,7 @@ class TimedRequests(H11Protocol):
         super().connection_lost(exc)
 
     def pause_writing(self) -> None:
-        """Have the application wait, because the client does not read what was sent; but not for ever."""
+        """Make the application wait while the client does not read the data that was sent, up to a limit."""
         super().pause_writing()
         self._watch_reading(self.transport.get_write_buffer_size())
 

@@ -88,7 +88,7 @@ class Engine:
         self._stop = threading.Event()
         self._prepare: Callable[[], None] | None = None
         self.turns = 0
-        """Turns that the thread has taken; a count that stands still is a thread that hangs."""
+        """Number of turns, passes of the thread's loop, that have ended. If it stops growing, the thread hangs."""
         self._thread = threading.Thread(target=self._work, name="fusion", daemon=True)
         self.failure: BaseException | None = None
         """The error that has ended the thread, if it has ended."""
@@ -96,12 +96,12 @@ class Engine:
 
     @property
     def has_turned(self) -> bool:
-        """True once the thread has taken its first turn: the modules that compute are loaded by then."""
+        """True once the first turn of the thread has ended. The modules that compute are loaded by then."""
         return self.turns > 0
 
     @property
     def updates_left_out(self) -> int:
-        """Windows of this run that were not localized because newer ones were due."""
+        """Number of windows of this run that were not located because newer ones were due."""
         return self._run.fusion.updates.left_out
 
     def start(self, prepare: Callable[[], None]) -> None:
@@ -117,10 +117,10 @@ class Engine:
         self._parallel.stop()
 
     def prepare(self, site: Site) -> Callable[[], None]:
-        """Prepare to locate with the poses of this site; return what does so from the next turn on; on any thread.
+        """Prepare to locate with the poses of a site; return a function that puts them into force at the next turn.
 
-        Sounds that have begun are located as before. The tables of the estimator are computed here, so that the fusion
-        thread does not wait for them.
+        Any thread may call both. Sounds that have begun are still located with the poses in force before. The tables of
+        the estimator are computed here, so that the fusion thread does not wait for them.
         """
         set_up = make_array_set_up(site, self._parallel.for_each)
         for array, rate_hz in tuple(self._rates_hz.items()):
@@ -128,9 +128,9 @@ class Engine:
         return partial(self._coming.append, (site, set_up))
 
     def wait_idle(self) -> None:
-        """Return when the replay that was sent has ended and its last event is published.
+        """Wait until the replay that was sent has ended and its last event is published.
 
-        The first turn comes after what computes is loaded; until then it is not known whether a replay was sent.
+        Before the first turn it is not known whether a replay was sent.
         """
         while self.failure is None and self._thread.is_alive():
             if self.has_turned and not self._site_time.replay_is_running:
@@ -138,9 +138,11 @@ class Engine:
             self._stop.wait(WAIT_S)
 
     def turn(self) -> None:
-        """Take in what has arrived, step the fusion, and publish; waits up to `WAIT_S` for the first message.
+        """Take one turn: process the messages that have arrived, step the fusion, and publish the results.
 
-        The thread calls it for ever; without the thread, any other caller may.
+        A turn waits up to `WAIT_S` for its first message.
+
+        The thread calls it until the server stops. If the thread is not started, any other caller may call it.
         """
         while self._coming:
             self._site, set_up = self._coming.popleft()
@@ -165,7 +167,7 @@ class Engine:
         self._array_states.watch()
 
     def _adapt(self, items: int, waited_ns: int) -> None:
-        """Shed what the load demands; a replay waits instead, and nothing of it is shed."""
+        """Set the work that is shed under the present load; in a replay nothing is shed, because the replay waits."""
         run, live = self._run, not self._site_time.is_replay
         relief = self._overload.note(self._receiver.delay_s, items, waited_ns, sheds=live)
         run.fusion.relieve(relief)

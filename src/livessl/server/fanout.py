@@ -226,7 +226,7 @@ class Fanout:
         self.superseded = 0
         """Messages dropped from the queues of slow clients."""
         self.ended = asyncio.Event()
-        """Set when the server stops: streams that would last for ever end then."""
+        """Set when the server stops, so that endless streams end."""
 
     @property
     def clients(self) -> int:

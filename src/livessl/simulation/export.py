@@ -1,4 +1,4 @@
-"""A simulated scene as a session on disk: a WAV for each array, the truth, and the data for replay."""
+"""Writes a simulated scene as a session: a WAV file for each array, the truth, and the data for replay."""
 
 from __future__ import annotations
 
@@ -60,8 +60,8 @@ def write_scene(
 ) -> None:
     """Render a scene for every array of a site into a folder: `ARRAY.wav` (16 bit), `truth.jsonl`, and a session.
 
-    A simulated session that is there is replaced with all its files once the new one is complete, and stays as it is if
-    that fails or is interrupted. What runs that were killed have left in the folder is removed.
+    An earlier simulated session in the folder is replaced as soon as the new one is complete. If rendering fails or is
+    interrupted, the earlier session remains unchanged. Files that killed runs have left in the folder are removed.
 
     Parameters
     ----------
@@ -111,9 +111,10 @@ def _write(
 
 
 def _take_place(finished: Path, directory: Path) -> None:
-    """Move a session to its place, in an order that lets `simulated_files` know its files again at almost any end.
+    """Move a finished session into its folder.
 
-    The recordings before go first, and the new ones come last: a session never has recordings of another one.
+    Old recordings are deleted first, and new recordings are moved last, so that a session never has recordings of
+    another one. If the process is killed meanwhile, `simulated_files` still recognizes the files in almost all cases.
     """
     before = simulated_files(directory)
     described = [TRUTH_FILE, SESSION_FILE, SITE_FILE]

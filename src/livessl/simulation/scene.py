@@ -1,4 +1,4 @@
-"""Scenes, i.e. sounds at positions and times in a room, and the recordings of microphones in it."""
+"""Makes scenes, which are sounds at positions and times in a room, and renders the recordings of microphones there."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from livessl.simulation.room import absorption, impulse_responses
 from livessl.simulation.sounds import SOUNDS
 
 NamedSound = tuple[str, Float32Array]
-"""Name, and mono samples (n,)."""
+"""Name of a sound, and its mono samples (n,)."""
 
 CLEARANCE_M: Final = 1.0
 """Least distance from a source to the centre of an array."""
 
 MAX_JITTER_S: Final = 0.5
-"""Longest random addition to the pause between sources, so that they keep no beat."""
+"""Longest random addition, in seconds, to the pause between sounds, so that their starts are not periodic."""
 
 OWN_RATES_HZ: Final = (8000.0, 1e6)
-"""Lowest and highest sampling rate, in hertz, of the project's own sounds: below, half the rate is within the band of
-their hiss, and above, the samples of a second fill the memory."""
+"""Lowest and highest sampling rate, in hertz, of the project's own sounds. At lower rates, half the rate would be
+within the band of their hiss; at higher rates, the samples of a second would fill the memory."""
 
 TRIES: Final = 10_000
-"""Number of draws after which no position is taken to be free."""
+"""Number of random positions that are tried before the room counts as having no free position."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,11 +44,11 @@ class Source:
     name : str
         Name of the sound.
     start_s : float
-        Emission of its first sample, seconds after the start of the scene.
+        Time at which the first sample is emitted, seconds after the start of the scene.
     position_m : (3,) float64
         Metres.
     sound : (n,) float32
-        At the scene's sample rate; read-only from here on.
+        Samples at the scene's sample rate; the array is made read-only.
 
     Raises
     ------
@@ -83,20 +83,20 @@ class Scene:
     room_size_m : (3,) float
         Metres, one corner at the origin.
     rt60_s : float
-        Nominal reverberation time in seconds, 0 is anechoic: see `livessl.simulation.room.absorption`.
+        Nominal reverberation time in seconds; 0 is anechoic. See `livessl.simulation.room.absorption`.
     c_m_s : float
         Speed of sound, m/s.
     sample_rate_hz : float
         Sample rate of the sounds and of the rendered recordings.
     sources : tuple of Source
-        In order of their starts.
+        Sources in the order of their starts.
     duration_s : float
-        Length in seconds; later sound is cut off.
+        Length of the scene in seconds; later sound is cut off.
     noise_dbfs : float
         RMS of each microphone's own white noise, dB re full scale (1.0).
     level_dbfs : float
-        Peak expected 1 m away from the source with the largest peak, direct and reverberant sound together, dB re
-        full scale. The sounds keep their levels relative to one another.
+        Expected peak of direct and reverberant sound, 1 m away from the source with the largest peak, dB re full scale.
+        The levels of the sounds relative to one another do not change.
     """
 
     room_size_m: tuple[float, float, float]
@@ -126,8 +126,9 @@ def make_scene(
 ) -> Scene:
     """Place sounds at random in a room, one after the other.
 
-    Positions are uniform in the allowed part of the room. Sounds are taken in random order, each as often as any
-    other. Starts fall on whole samples and keep no beat; each sound begins after the reverberation of the one before.
+    Positions are uniform in the allowed part of the room. Sounds are used in random order, each equally
+    often. Starts fall on whole samples and are not periodic. Each sound begins after the reverberation of the sound
+    before it.
 
     Parameters
     ----------
@@ -144,17 +145,17 @@ def make_scene(
     c_m_s : float
         Speed of sound, m/s.
     keep_away_m : (n, 3)
-        Centres of the arrays, metres: no source is within 1 m of one.
+        Centres of the arrays, metres. Every source is at least 1 m away from them.
     seed : int
         The same seed and arguments give the same scene.
     lead_s : float
         Silence before the first source, seconds.
     gap_s : float
-        Least pause, seconds, from a sound's end plus `rt60_s` to the next start, and to the end of the scene.
+        Least pause, seconds, between the end of a sound plus `rt60_s` and the start of the next, or the scene's end.
     margin_m : float
         Least distance from the walls, metres.
     height_m : (float, float)
-        Least and greatest height, metres, cut to what the margin leaves.
+        Least and greatest height, metres, limited further by `margin_m`.
 
     Raises
     ------
@@ -189,25 +190,25 @@ def render(
     seed: int,
     progress: Callable[[int, int], None] | None = None,
 ) -> Float32Array:
-    """Compute what microphones record of a scene.
+    """Compute the recordings of microphones in a scene.
 
-    The gain follows from the scene alone, so arrays rendered apart keep their levels relative to one another.
+    The gain depends only on the scene, so the relative levels of arrays are right even if they are rendered separately.
 
     Parameters
     ----------
     scene : Scene
-        The scene; a start between two samples is moved to the nearer.
+        The scene. A start between two samples is moved to the nearer sample.
     microphones_m : (K, 3)
         Absolute positions, metres.
     seed : int
-        Seed of the microphones' own noise. Microphones rendered apart need different seeds to have independent noise.
+        Seed of the microphones' own noise. Use different seeds for separate calls, so that their noise is independent.
     progress : callable or None
-        Called with (sources done, sources in all) after each.
+        Called after each source with (sources done, sources in all).
 
     Returns
     -------
     (K, n) float32
-        In [-1, 1].
+        Samples in [-1, 1].
 
     Raises
     ------
@@ -250,7 +251,7 @@ def truth(scene: Scene) -> list[dict[str, object]]:
     Returns
     -------
     list of dict
-        For each source its `name`, `start_s` (emission of its first sample after the start of the scene, seconds),
+        For each source: `name`, `start_s` (time of its first sample after the start of the scene, seconds),
         `duration_s` (without reverberation) and `position_m` [x, y, z].
     """
     return [
@@ -265,7 +266,7 @@ def truth(scene: Scene) -> list[dict[str, object]]:
 
 
 def synthesised_sounds(sample_rate_hz: float, seed: int) -> list[NamedSound]:
-    """Synthesise one of each of the project's own sounds, (name, (n,) float32); the seed determines them.
+    """Synthesise each of the project's own sounds once: (name, (n,) float32). The seed determines the samples.
 
     Raises
     ------
@@ -289,19 +290,19 @@ def read_sounds(directory: Path, sample_rate_hz: float) -> list[NamedSound]:
     Parameters
     ----------
     directory : Path
-        Its subdirectories are not searched.
+        Directory with the files; its subdirectories are not searched.
     sample_rate_hz : float
         Sample rate of the result; files with another rate are resampled.
 
     Returns
     -------
     list of (name, (n,) float32)
-        File name without its ending, and the mean of the channels.
+        Name of each file without its ending, and the mean of its channels.
 
     Raises
     ------
     ValueError
-        If there is no such file, or one cannot be read, is empty, silent or has values that are not finite.
+        If there is no such file, or a file cannot be read, is empty, silent or has values that are not finite.
     """
     paths = sorted(path for path in directory.glob("*") if path.suffix.lower() in {".wav", ".flac"})
     if not paths:
@@ -332,8 +333,8 @@ def _amplitude(level_db: float) -> float:
 def _gain(scene: Scene) -> np.float32:
     """Return the factor that gives the largest peak of all sources the level `level_dbfs` at 1 m.
 
-    A direct path has the amplitude 1/(4 pi) there, and the diffuse field 16 pi (1 - alpha) / (alpha S) times its power
-    (critical distance: Kuttruff, Room Acoustics, ch. 5).
+    At 1 m a direct path has the amplitude 1/(4 pi), and the diffuse field 16 pi (1 - alpha) / (alpha S) times the power
+    of the direct path (critical distance: Kuttruff, Room Acoustics, ch. 5).
     """
     peak = max((float(np.abs(source.sound).max()) for source in scene.sources), default=0.0)
     if peak == 0.0:

@@ -92,7 +92,7 @@ def wall_responses(
     c_m_s : float
         Speed of sound, m/s.
     facing : (3,) float64 or None
-        Direction that a `TALKER` faces; None for a source that radiates alike in all directions.
+        Direction that a `TALKER` faces; None for a source that radiates equally in all directions.
 
     Returns
     -------

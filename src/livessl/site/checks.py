@@ -30,7 +30,7 @@ from livessl.site.place import Finding, Place
 from livessl.site.zone_models import Zone
 
 COINCIDENT_M: Final = 1e-3
-"""Distance in metres below which two microphones are taken for a slip in the file: capsules are larger than that."""
+"""Distance, in metres, between two microphones below which the file must be wrong: capsules are larger."""
 
 MOST_GRID_POINTS: Final = 10**18
 """Most points of the search grid, which are numbered in 64 bits."""

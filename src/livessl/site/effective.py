@@ -1,4 +1,4 @@
-"""The configuration that is in effect: every setting of a site with its value and the source of that value."""
+"""Lists the configuration in effect: every setting of a site, with its value and the source of the value."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from livessl.site.place import Place
 from livessl.site.slips import quote_keys
 
 DEFAULT: Final = "default"
-"""Source of a value that the site file does not give."""
+"""Source of a value that is not in the site file."""
 
 _POSE: Final = frozenset(("microphones_m", "geometry", "position_m", "orientation_deg"))
 _SHAPES: Final = frozenset(("tetrahedron", "circle", "line"))
@@ -32,11 +32,11 @@ class Setting:
     place : tuple
         Keys of the setting, from the top of the file.
     value : Any
-        Value that JSON can hold; None for a setting that is not used.
+        Value of a type that JSON has; None for a setting that is not used.
     source : str
-        "FILE:LINE", or why the value is what it is, such as "default".
+        Source of the value: "FILE:LINE", or words such as "default".
     line : int or None
-        Line of the site file; None if the file does not give the value.
+        Line of the site file; None if the value is not in the file.
     """
 
     place: Place
@@ -61,7 +61,7 @@ def effective_settings(path: Path) -> list[Setting]:
     Raises
     ------
     ConfigError
-        With every fault of the file.
+        If the site file has faults; the error lists all of them.
     """
     site = load_site(path)
     root = nodes_of(path.read_text(encoding="utf-8"))
@@ -81,7 +81,7 @@ def effective_settings(path: Path) -> list[Setting]:
 
 
 def _measured(site: Site) -> set[str]:
-    """Return the names of the arrays whose microphones the calibration file gives."""
+    """Return the names of the arrays whose microphones are in the calibration file."""
     return set() if site.calibration is None else set(read_calibration(site.file(site.calibration)).arrays)
 
 
@@ -99,7 +99,7 @@ def _calibrated(setting: Setting, site: Site, measured: set[str]) -> Setting | N
 
 
 def _inherited(setting: Setting, settings: list[Setting]) -> Setting:
-    """Return a setting with the site's value, if it is one of an array that the file does not give; else unchanged."""
+    """Return an array's setting with the value of the whole site if the file does not set it; otherwise unchanged."""
     above = setting.place[2:] if setting.place[0] == "arrays" else ()
     if setting.line is not None or above[:1] not in (("band_hz",), ("uncertainty",)):
         return setting
@@ -115,7 +115,7 @@ def _is_unused(setting: Setting) -> bool:
 
 
 def _leaves(value: Any, place: Place = ()) -> Iterator[tuple[Place, Any]]:
-    """Yield every value that is no mapping; an empty mapping is a value."""
+    """Yield every value that is not a mapping, and every empty mapping."""
     if isinstance(value, Mapping) and value:
         for key, inner in value.items():
             yield from _leaves(inner, (*place, key))

@@ -71,14 +71,14 @@ class HttpConfig(Model):
 
 
 class SinkConfig(Model):
-    """Another destination of events, of one of the types in `livessl.site.sink_types`."""
+    """A sink: a further destination of events. `livessl.site.sink_types` has the types."""
 
     type: Annotated[str, AfterValidator(check_sink_type)]
     path: FileName
 
 
 class ClipsConfig(Model):
-    """Sound of events that is kept, and the statuses of those events."""
+    """Clips: of which events sound is stored, by their statuses, and for how long."""
 
     folder: FileName
     of: Annotated[tuple[Status, ...], Field(min_length=1)] = tuple(Status)
@@ -107,6 +107,6 @@ class ServerConfig(Model):
 
 
 class StoreConfig(Model):
-    """Retention of events in days; None keeps them for ever."""
+    """Retention of events in days; with None, events are never deleted."""
 
     retention_days: Positive | None = None

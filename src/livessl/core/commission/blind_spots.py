@@ -25,46 +25,45 @@ from livessl.core.types import FloatArray
 
 MOST_HIDDEN_M: Final = 0.3
 MOST_HIDDEN_DEG: Final = 10.0
-"""Shift, in metres, and turn, in degrees, up to which hidden faults are not reported: sounds in all parts of a room
-show as much to three arrays."""
+"""Shift, in metres, and rotation, in degrees, up to which hidden faults are not reported. With three arrays and sounds
+in all parts of a room, larger faults become visible."""
 
 SURELY: Final = 1.3
-"""Standard deviations by which a fault must exceed the least size that is reported, so that it is reported nine times
-of ten."""
-
+"""Number of standard deviations by which a fault must exceed the least reported size, so that it is reported nine times
+out of ten."""
 
 _SAME_DEG: Final = 15.0
 _SAME_RATIO: Final = 1.1
-"""Angle between two directions, in degrees, and ratio of two sizes, below which they are taken for the same."""
+"""Angle between two directions, in degrees, and ratio of two sizes, below which both count as equal."""
 
 _LEAST_SEEN: Final = 1e-12
-"""Least growth of the deviance for each metre or degree squared, so that what nothing shows has a size at all."""
+"""Least growth of the deviance per square metre or degree, so that a fault without any effect gets a finite size."""
 
 
 def blind_spots(
     microphones: Microphones, delays: Delays, bounds_m: FloatArray, c_m_s: float, known: Known
 ) -> tuple[BlindSpot, ...]:
-    """Return what sounds at unknown places hide: a reflection of the room, and of each array its shifts and turns.
+    """Return the faults that sounds at unknown places hide: a reflection of the room, and shifts and rotations.
 
     Parameters
     ----------
     microphones : mapping of array to (K, 3) float64
-        As filed, metres.
+        Positions of the microphones as filed, metres.
     delays : mapping of array to (S, K) float64
-        Delays of the same S sounds at each array, seconds; NaN where an array did not receive one.
+        Delays of the same S sounds at each array, seconds; NaN if an array did not receive a sound.
     bounds_m : (3, 2) float64
         Search volume, metres.
     c_m_s : float
         Speed of sound as filed, m/s.
     known : Known
-        How exactly the set-up and the delays are known.
+        Uncertainty of the set-up and of the delays.
 
     Returns
     -------
     tuple of BlindSpot
-        The reflection first (`livessl.core.commission.mirror`), then the shifts and turns that are larger than
-        `MOST_HIDDEN_M` and `MOST_HIDDEN_DEG`; empty with fewer than two arrays or three sounds, which show no pose at
-        all.
+        The reflection (`livessl.core.commission.mirror`), then the shifts larger than `MOST_HIDDEN_M` and the rotations
+        larger than `MOST_HIDDEN_DEG`. Empty with fewer than two arrays or three sounds, from which poses cannot be
+        judged.
     """
     if len(delays) < 2 or len(next(iter(delays.values()))) < LEAST_SOUNDS:
         return ()
@@ -91,9 +90,9 @@ def blind_spots(
 
 
 def _weakest(fault: str, array: str, seen: FloatArray, arrays: int) -> BlindSpot:
-    """Return the direction in which a fault shows least, and how large the fault must be there to be reported.
+    """Return the direction in which a fault has the least effect, and the size from which it is reported there.
 
-    `seen` (3, 3) is the growth of the deviance for each metre or degree squared.
+    `seen` (3, 3) is the growth of the deviance per square metre or square degree.
     """
     needed = np.sqrt(COSTS[fault] + least_gain(arrays)) + SURELY
     values, vectors = np.linalg.eigh(seen)
@@ -104,7 +103,7 @@ def _weakest(fault: str, array: str, seen: FloatArray, arrays: int) -> BlindSpot
 
 
 def _joined(spots: Sequence[BlindSpot]) -> Iterator[BlindSpot]:
-    """Yield blind spots of one fault, those of several arrays joined that are one and the same."""
+    """Yield the blind spots of one fault; arrays with the same direction and size share one."""
     rest = list(spots)
     while rest:
         first = rest[0]

@@ -1,6 +1,6 @@
 """Delays of one sound between the microphones of one array, measured without knowing where they are.
 
-The poses, the geometry and the order of the channels in the site file have no part in it, so that they can be examined
+The poses, the geometry and the order of the channels in the site file are not used, so that they can be examined
 with the result. The polarity of each microphone is measured with its delay: an inverted one turns the peaks of its
 pairs upside down.
 """

@@ -1,4 +1,4 @@
-"""Peaks of power maps: found in a whole map, refined below the grid, with a covariance and a margin."""
+"""Finds peaks in power maps, refines them between grid points, and computes their covariance and margin."""
 
 from __future__ import annotations
 
@@ -16,24 +16,25 @@ from livessl.core.locate.srp import PairTerms, SRPFunctional
 from livessl.core.types import BoolArray, Evidence, Float32Array, FloatArray, IntArray
 
 CANDIDATES: Final = 2
-"""Grid points that are refined: of two tops between grid points, the one with the lower grid point may be higher."""
+"""Number of grid points that are refined. Of two maxima between grid points, the higher one may be near the lower grid
+point."""
 
 RIVAL_DISTANCE_M: Final = 1.0
-"""Distance, in metres, beyond which a second peak is another place."""
+"""Distance, in metres, beyond which a second peak counts as another place."""
 
 _NEWTON_STEPS: Final = 30
-"""Most Newton steps of one climb; a few suffice."""
+"""Largest number of Newton steps of one climb; usually a few suffice."""
 
 _CONVERGED_M: Final = 1e-4
-"""Shortest step, in metres: a tenth of a millimetre cannot be measured."""
+"""Length of a step, in metres, at which a climb ends; shorter steps cannot be measured."""
 
 _SUBDIVISIONS: Final = 4
-"""Parts into which a cell's edge is divided to find the start of a climb."""
+"""Number of parts into which the edge of a cell is divided to find the start of a climb."""
 
 
 @dataclass(frozen=True, slots=True)
 class Peak:
-    """A grid point, the fused power there, and the distance to the next points that were examined, in grid points."""
+    """A grid point, its fused power, and its distance to the next examined points, in grid points."""
 
     point: int
     power: float
@@ -41,12 +42,12 @@ class Peak:
 
 
 class FindPeaks(Protocol):
-    """Finds the highest grid points, best first: each is the highest of those far enough from the ones before it."""
+    """Finds the highest grid points in descending order; each is far enough from all before it."""
 
     def __call__(self, count: int, apart_points: int = 1, without: Sequence[IntArray] = ()) -> list[Peak]:
-        """Find up to `count` peaks that differ by more than `apart_points` along some axis, none of them in a box.
+        """Find up to `count` peaks outside the boxes `without` that differ by more than `apart_points` along some axis.
 
-        A box (3, 2) is the first and last point along each axis. The first of equal points in the grid's order wins.
+        A box (3, 2) has the first and last point along each axis. Of equal points, the first in the grid's order wins.
         """
         ...
 
@@ -73,16 +74,16 @@ def in_map(power: Float32Array, grid: Grid) -> FindPeaks:
 
 
 def box_around(grid: Grid, point: int, apart_points: int) -> IntArray:
-    """Return the box (3, 2) of points at most `apart_points` from one along each axis: the first and last of each."""
+    """Return the box (3, 2), first and last along each axis, of the points at most `apart_points` away from a point."""
     at = np.array(np.unravel_index(point, grid.shape))
     return np.stack([at - apart_points, at + apart_points], axis=1)
 
 
 def neighbourhood(position_m: FloatArray, grid: Grid) -> IntArray:
-    """Return the box (3, 2) of points that are the same place as a position: the first and last along each axis.
+    """Return the box (3, 2) of points that count as the same place as a position: first and last along each axis.
 
-    It reaches `RIVAL_DISTANCE_M` along every axis, or a quarter of the volume's longest edge if that is less. Along an
-    axis without such points it is (1, 0).
+    The box reaches `RIVAL_DISTANCE_M` along every axis, or a quarter of the volume's longest edge if that is less.
+    Along an axis without such points the box is (1, 0), which is empty.
     """
     reach_m = min(RIVAL_DISTANCE_M, 0.25 * float((grid.upper_m - grid.lower_m).max()))
     box = np.empty((3, 2), dtype=np.int64)
@@ -93,15 +94,16 @@ def neighbourhood(position_m: FloatArray, grid: Grid) -> IntArray:
 
 
 def refine_peaks(functional: SRPFunctional, peaks: Sequence[Peak], grid: Grid) -> tuple[FloatArray, float]:
-    """Find the highest top near any of some peaks of a search: see `refine`."""
+    """Find the highest maximum near some peaks of a search: see `refine`."""
     starts_m = np.stack([grid.point_m(peak.point) for peak in peaks])
     return refine(functional, starts_m, grid, max(peak.stride for peak in peaks))
 
 
 def refine(functional: SRPFunctional, starts_m: FloatArray, grid: Grid, stride: int = 1) -> tuple[FloatArray, float]:
-    """Find the highest top near any of some grid points.
+    """Find the highest maximum near some grid points.
 
-    Around every start a finer local grid is examined; from its best point Newton steps climb, and only upwards.
+    A finer local grid around every start is examined. Newton steps then climb from its highest point; a step that does
+    not increase the power is shortened.
 
     Parameters
     ----------
@@ -110,37 +112,37 @@ def refine(functional: SRPFunctional, starts_m: FloatArray, grid: Grid, stride: 
         Metres.
     grid : Grid
     stride : int
-        Distance between points that were examined, in grid points.
+        Distance between neighbouring points that the search examined, in grid points.
 
     Returns
     -------
     position_m : (3,) float64
         Inside the grid's bounds.
     value : float
-        The functional there.
+        Value of the functional at the position.
     """
     tops = [_climb(functional, *top, grid, stride) for top in _finer(functional, starts_m, grid, stride)]
     return max(tops, key=lambda top: top[1])
 
 
 def near_top(functional: SRPFunctional, peak: Peak, grid: Grid) -> tuple[FloatArray, float]:
-    """Return the highest point of the finer local grid around a peak, and the functional there, without climbing.
+    """Return the highest point of the finer local grid around a peak, and the value of the functional there.
 
-    It costs a tenth of `refine_peaks`, and is off by at most half of the finer spacing along each axis.
+    This takes a tenth of the time of `refine_peaks`. The error is at most half of the finer spacing along each axis.
     """
     (top,) = _finer(functional, grid.point_m(peak.point), grid, peak.stride)
     return top
 
 
 def _finer(functional: SRPFunctional, starts_m: FloatArray, grid: Grid, stride: int) -> list[tuple[FloatArray, float]]:
-    """Highest point of a finer local grid around each start (N, 3) or (3,), and the functional there."""
+    """Return the highest point of a finer local grid around each start (N, 3) or (3,), and its value."""
     near = np.clip(np.atleast_2d(starts_m)[:, None] + stride * _offsets_m(grid), grid.lower_m, grid.upper_m)
     values = functional.value(near.reshape(-1, 3)).reshape(near.shape[:2])
     return [(near[n, k], float(values[n, k])) for n, k in enumerate(values.argmax(axis=1))]
 
 
 def _offsets_m(grid: Grid) -> FloatArray:
-    """Finer local grid of a cell, relative to its centre: (n, 3), metres."""
+    """Return the finer local grid of a cell, relative to the cell's centre: (n, 3), metres."""
     fraction = np.linspace(-0.5, 0.5, _SUBDIVISIONS + 1)
     offsets = [fraction * edge if edge > 0 else np.zeros(1) for edge in grid.cell_m]
     return np.stack([o.ravel() for o in np.meshgrid(*offsets, indexing="ij")], axis=1)
@@ -174,25 +176,25 @@ def _climb(
 
 
 def _ascent(gradient: FloatArray, hessian: FloatArray) -> FloatArray:
-    """Newton step with every curvature taken as negative, so that it leads up from a saddle as well."""
+    """Return the Newton step with every curvature made negative, so that it also leads upwards from a saddle point."""
     eigenvalues, eigenvectors = np.linalg.eigh(hessian)
     strength = np.maximum(np.abs(eigenvalues), 1e-3 * np.abs(eigenvalues).max(initial=0.0) + 1e-12)
     return np.asarray(eigenvectors @ ((eigenvectors.T @ gradient) / strength))
 
 
 def rival_power(find: FindPeaks, grid: Grid, position_m: FloatArray) -> float:
-    """Highest power outside a position's `neighbourhood`; 0 where there is no outside."""
+    """Return the highest power outside the `neighbourhood` of a position; 0 if the neighbourhood is the whole grid."""
     rivals = find(1, without=[neighbourhood(position_m, grid)])
     return rivals[0].power if rivals else 0.0
 
 
 def margin(power: float, rival_power: float) -> float:
-    """Margin of a place over the best other one: 1 - (power there) / (power here), 0 to 1."""
+    """Return the margin of a place over the best other place: 1 - `rival_power` / `power`, 0 to 1."""
     return float(np.clip(1.0 - max(rival_power, 0.0) / power, 0.0, 1.0)) if power > 0.0 else 0.0
 
 
 def confidence(find: FindPeaks, first: Peak, grid: Grid, position_m: FloatArray) -> float:
-    """Confidence that is no probability: the peak's `margin` over the highest power outside its `neighbourhood`."""
+    """Return the `margin` of a peak over the highest power outside its `neighbourhood`; it is not a probability."""
     return margin(first.power, rival_power(find, grid, position_m))
 
 
@@ -202,7 +204,7 @@ def laplace_covariance_m2(
     """Covariance (3, 3) from the map's curvature at the peak: C = (sum lambda (-Hess SRP) + prior)^-1.
 
     The scale lambda = g / s^2 of each array makes the map a log-likelihood: g is the mean height of its GCCs at the
-    peak, s^2 their mean square over the other lags, which holds noise and reflections alike. It follows from
+    peak, s^2 their mean square over the other lags, which contain noise and reflections. The scale follows from
     var(tau) = s^2 kappa / (g kappa)^2, kappa the mean square angular frequency: noise of power s^2 and slope variance
     s^2 kappa moves a peak of curvature g kappa. The prior is the search volume's own variance, L^2/12 along each axis,
     so that a coordinate that the arrays do not determine is as uncertain as the volume is wide.
@@ -239,7 +241,7 @@ def placement_covariance_m2(
 
 
 def noise(evidence: Evidence, term: PairTerms, live: BoolArray) -> float:
-    """Mean square of an array's GCCs away from the peak, of the pairs that are `live` (P,)."""
+    """Return the mean square of an array's GCCs away from the peak, over the pairs that are `live` (P,)."""
     lobe_s = 2.0 * np.pi / math.sqrt(mean_square_angular_frequency(evidence.spec.band_hz))
     return float(kernels.mean_square(evidence.gcc.values[live], evidence.gcc.lags_s, term.lags_s[live], lobe_s))
 

@@ -1,8 +1,9 @@
-"""Steered response power (SRP-PHAT): one array's GCC mapped onto the shared grid, and as a function of position.
+"""Steered response power (SRP-PHAT): maps an array's GCC onto the grid, and computes it as a function of position.
 
 SRP(r) = 2/K sum_{i<k} R_ik(tau_ik(r)) with tau_ik(r) = (|r - r_k| - |r - r_i|) / c and the lag's sign of `gcc_phat`.
-Of the K(K-1)/2 pairs only K-1 delays are independent; the factor 2/K counts each once, so that an array of 16
-microphones does not outweigh one of 4 merely by its number of pairs. Among equal arrays it changes nothing.
+Of the delays of K(K-1)/2 pairs only K-1 are independent. The factor 2/K gives every array the weight of its independent
+delays, so that an array of 16 microphones does not outweigh an array of 4 by its number of pairs. For arrays with the
+same number of microphones, the factor changes nothing.
 """
 
 from __future__ import annotations
@@ -22,14 +23,15 @@ from livessl.core.steering import NEAREST_M, alias_free_hz
 from livessl.core.types import GCC, ArraySpec, Evidence, Float32Array, FloatArray, IntArray
 
 _SLAB_POINTS: Final = 1 << 15
-"""Grid points whose delays are computed at once: as many as fit the second-level cache."""
+"""Number of grid points whose delays are computed at one time: as many as fit into the second-level cache."""
 
 
 @dataclass(frozen=True, slots=True)
 class LagPlaces:
-    """Place on a fine lag axis of a difference of distances d, in metres: the whole part of `d * scale + offset`.
+    """Formula for the index on a fine lag axis that belongs to a difference of distances d in metres.
 
-    It is computed in float32 and by this formula everywhere, so that a map and a search agree to the last bit.
+    The index is the integer part of `d * scale + offset`. Maps and the search all compute it by this formula in
+    float32, so that they agree to the last bit.
     """
 
     count: int
@@ -38,31 +40,31 @@ class LagPlaces:
 
     @classmethod
     def on(cls, lags_s: FloatArray, c_m_s: float) -> LagPlaces:
-        """Return the places on an axis (L,), in seconds, evenly spaced around zero."""
+        """Return the formula for a lag axis (L,), in seconds, with even spacing around zero."""
         scale = 1.0 / ((lags_s[1] - lags_s[0]) * c_m_s)
         return cls(len(lags_s), np.float32(scale), np.float32(len(lags_s) // 2 + 0.5))
 
 
 class SRPMapper:
-    """Maps an array's GCC onto the grid by the nearest fine lag: one look-up for each pair and grid point.
+    """Maps an array's GCC onto the grid by the nearest fine lag, with one look-up for each pair and grid point.
 
-    With cut-offs, each look-up uses the GCC of the highest band that is free of spatial aliasing there
-    (`alias_free_hz`), or of the lowest band if none is. A narrower band lowers a point's power, which is not
-    normalised, because that would raise the noise too.
+    With cut-offs, each look-up uses the GCC of the widest band that is free of spatial aliasing at that point
+    (`alias_free_hz`), or of the narrowest band if none is free of it. A narrower band lowers the power of a point. The
+    power is not normalised, because normalising would also raise the noise.
 
     Parameters
     ----------
     spec : ArraySpec
         The array.
     grid : Grid
-        The shared grid.
+        Grid that all arrays use.
     pairs : (P, 2) int64
     lags_s : (L,) float64
         Lag axis of the GCCs to be mapped.
     c_m_s : float
         Speed of sound, m/s.
     cut_offs_hz : sequence of float
-        Cut-offs in descending order; the GCC of the whole band is followed by one of the part below each.
+        Cut-offs in descending order. The GCC of the whole band is followed by one GCC for the band below each cut-off.
     """
 
     def __init__(
@@ -88,11 +90,11 @@ class SRPMapper:
                 place = place + len(lags_s) * np.minimum(len(ascending_hz) - free, len(cut_offs_hz))
             table[first : first + len(points_m)] = place.T
         self._weight = np.float32(pair_weight(len(spec.microphones_m)))
-        self._kernels = kernels.in_use  # the table is in its form
+        self._kernels = kernels.in_use  # the table has the form that these kernels need
         self._table = self._kernels.look_up_table(table, columns)
 
     def add(self, power: Float32Array, *gccs: GCC) -> None:
-        """Add the power of a GCC, followed by those below each cut-off, to the power (G,) at every grid point."""
+        """Add the power of a GCC and of the GCCs below each cut-off to `power` (G,), the power at every grid point."""
         values = gccs[0].values if len(gccs) == 1 else np.concatenate([gcc.values for gcc in gccs], axis=1)
         self._kernels.add_power(np.ascontiguousarray(values, dtype=np.float32), self._table, self._weight, power)
 
@@ -109,7 +111,7 @@ class SRPFunctional:
     Parameters
     ----------
     evidence : sequence of Evidence
-        One for each array.
+        One item for each array.
     c_m_s : float
         Speed of sound, m/s.
     """
@@ -137,7 +139,7 @@ class SRPFunctional:
         )
 
     def value(self, points_m: FloatArray) -> FloatArray:
-        """SRP at points (N, 3), in metres: (N,)."""
+        """Return the SRP (N,) at points (N, 3), in metres."""
         return np.asarray(kernels.smooth_power(np.ascontiguousarray(points_m), self.c_m_s, self._rows))
 
     def pair_terms(self, point_m: FloatArray) -> list[PairTerms]:
@@ -147,13 +149,13 @@ class SRPFunctional:
         return [PairTerms(name, *(part[first:end] for part in terms)) for name, first, end in parts]
 
     def derivatives(self, point_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Gradient (3,) and Gauss-Newton Hessian (3, 3) at one point: sum R' grad tau, sum R'' grad tau grad tau^T."""
+        """Return gradient (3,) and Gauss-Newton Hessian (3, 3): sum R' grad tau, sum R'' grad tau grad tau^T."""
         _, slope, curvature, gradient, _ = self._terms(point_m)
         weight = self._rows.weight
         return (weight * slope) @ gradient, (gradient.T * (weight * curvature)) @ gradient
 
     def _terms(self, point_m: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-        """R, R', R'', grad tau and tau of all pairs."""
+        """Return R, R', R'', grad tau and tau of all pairs."""
         rows = self._rows
         towards = point_m - rows.microphones_m
         distance = np.sqrt((towards**2).sum(axis=1))
@@ -168,7 +170,7 @@ class SRPFunctional:
 
 @dataclass(frozen=True, slots=True)
 class PairTerms:
-    """One array's pairs at one point: R, R' (1/s), R'' (1/s^2), grad tau (P, 3) (s/m) and tau (s), each (P,)."""
+    """Terms of an array's pairs at a point: R, R' (1/s), R'' (1/s^2), grad tau (P, 3) (s/m) and tau (s), each (P,)."""
 
     array: str
     values: FloatArray

@@ -58,7 +58,7 @@ WHERE: Final[Mapping[str, tuple[float, float]]] = {"inside": (0.0, 0.7), "edge":
 is furthest from there."""
 
 FACING: Final = ("all around", "towards", "away")
-"""Radiation of a source: alike in all directions, or as a talker who faces the nearest array, or turns away from it."""
+"""Radiation of a source: equal in all directions, or as a talker who faces the nearest array or turns away from it."""
 
 OTHER_NOISE: Final = ("diffuse", 20.0)
 """Kind and level, in dB, of the noise with which the sounds of `OTHER_SOUNDS` are played."""
@@ -317,7 +317,7 @@ def where(room: NoiseRoom, place_m: FloatArray) -> str:
 
 
 def _faced(room: NoiseRoom, source_m: FloatArray, facing: str) -> FloatArray | None:
-    """Return the horizontal direction (3,) that a source faces; None if it radiates alike in all directions."""
+    """Return the horizontal direction (3,) that a source faces; None if it radiates equally in all directions."""
     if facing == FACING[0]:
         return None
     towards = min((spec.centre_m - source_m for spec in room.arrays), key=lambda way: float(np.linalg.norm(way)))

@@ -74,7 +74,7 @@ class NoiseRoom:
 
     @property
     def has_equal_walls(self) -> bool:
-        """True if all walls absorb alike, at all frequencies."""
+        """True if all walls have the same absorption at all frequencies."""
         return self.shares == _EQUAL and self.bands == (1.0,)
 
 

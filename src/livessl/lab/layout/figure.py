@@ -1,4 +1,4 @@
-"""A site as a figure: floor plan, side view, and each array with its microphone numbers. Needs matplotlib."""
+"""Draws a site with matplotlib: floor plan, side view, and each array with the numbers of its microphones."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 COLUMNS: Final = 4
-"""Arrays in a row of the enlarged views."""
+"""Number of enlarged arrays in a row."""
 
 MOST_ARRAYS: Final = 16
-"""Largest number of arrays that are enlarged; the first ones in the site file are taken."""
+"""Largest number of enlarged arrays; of more arrays, the first ones in the site file are drawn."""
 
 MARGIN: Final = 0.06
 """Margin of a view, as a share of its longest side."""
@@ -93,7 +93,7 @@ def _view(ax: Axes, site: Site, axes: tuple[int, int], title: str) -> None:
 
 
 def _enlarged(ax: Axes, spec: ArraySpec) -> None:
-    """Draw an array from above, with microphone numbers; those at one place, seen from above, share a label."""
+    """Draw an array from above with microphone numbers; microphones above one another share a label."""
     places = np.round(spec.microphones_m[:, :2], 3)
     numbers: dict[tuple[float, float], list[int]] = {}
     for number, (x, y) in enumerate(places.tolist(), 1):

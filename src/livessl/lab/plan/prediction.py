@@ -159,7 +159,7 @@ def delay_std_s(coherence2: ArrayLike, band_hz: tuple[float, float], time_s: flo
 
 @dataclass(frozen=True, slots=True)
 class Conditions:
-    """The conditions that disturb every array alike.
+    """The conditions that affect all arrays in the same way.
 
     Parameters
     ----------

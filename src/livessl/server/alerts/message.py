@@ -1,4 +1,4 @@
-"""Alerts as JSON objects, with a key that names each for ever and a sentence for people."""
+"""Makes alerts as JSON objects, each with a permanent key and a sentence for people."""
 
 from __future__ import annotations
 

@@ -79,7 +79,8 @@ class Webhook:
         Raises
         ------
         DeliveryError
-            If the address does not answer in time, or answers with another status. 410 means that it is gone for ever.
+            If the address does not answer in time, or answers with another status. 410 means that the address is gone
+            permanently.
         """
         try:
             async with asyncio.timeout(self._timeout_s):

@@ -197,7 +197,7 @@ class HubLink:
 
         A connection that dies silently is closed without `lost`: its TLS cannot be ended in good order.
         """
-        stream = client.jetstream()  # one for the connection: each has a subscription of its own, for ever
+        stream = client.jetstream()  # one for the connection, because each has its own subscription, which never ends
         while not (lost.is_set() or client.is_closed):
             self._news.clear()
             wait_s = REPORT_S

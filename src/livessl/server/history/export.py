@@ -1,4 +1,4 @@
-"""Events as CSV, JSON Lines or Parquet, piece by piece: what is in memory does not grow with the number of events."""
+"""Exports events as CSV, JSON Lines or Parquet, in parts, so that memory does not grow with the number of events."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _LISTS: Final = frozenset({"arrays", "heard_by", "zones"})
 
 
 def json_lines(pages: Pages) -> Iterator[bytes]:
-    """Yield one JSON object a line, as `GET events/{id}` has them."""
+    """Yield events as lines of one JSON object each, in the form of `GET events/{id}`."""
     for rows in pages:
         yield b"".join(row.body.encode() + b"\n" for row in rows)
 

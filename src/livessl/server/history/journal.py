@@ -36,7 +36,7 @@ class Entry:
     name : str
         What it is about: the rule, the number of the track, the array, or what was changed.
     key : str
-        Names the entry for ever; one of a known key is not stored again.
+        Permanent key of the entry. An entry whose key is already stored is not stored again.
     time_ns : int
         When it happened, in nanoseconds of site time.
     text : str

@@ -5,7 +5,7 @@
 //
 // Node.js imports it from a file: curl -o client.mjs http://127.0.0.1:8000/static/client.js
 //
-// It connects again for ever and resumes: every event that the server stores arrives, and no answer twice. After each
+// It always connects again and resumes: every event that the server stores arrives, and no answer twice. After each
 // connection it reads the server's log of stored events besides the WebSocket; what it knows is a copy. client.d.ts has
 // the types.
 

@@ -1,4 +1,4 @@
-// The WebSocket to the server: it reconnects for ever and measures how long the server has been silent.
+// The WebSocket to the server: it always reconnects, and measures how long the server has been silent.
 
 import { protocols } from "./access.js";
 
@@ -12,7 +12,7 @@ const TICK_MS = 250;
 const BACK_OFF_MS = [500, 800, 1300, 2100, 3400, 5000];
 
 /**
- * One WebSocket that reconnects for ever.
+ * One WebSocket that always reconnects.
  *
  * `onMessage(message)` gets each parsed message. `onState(state, silentMs)` is called at every tick and change; `state`
  * is "live", "stale" (open, but silent) or "down", and `silentMs` is null before the first message ever.

@@ -1,4 +1,4 @@
-"""Presence of tracks in zones: they enter, leave and loiter, with hysteresis, so that none flickers at an edge."""
+"""Decides when tracks enter and leave zones, or loiter there, with hysteresis so that no state flickers at an edge."""
 
 from __future__ import annotations
 
@@ -13,20 +13,21 @@ from livessl.schema.zones import Change
 from livessl.server.zones.zone_map import ZoneMap
 
 ENTER: Final = 0.7
-"""Probability of a zone from which on a track has entered it."""
+"""Least probability that a track is in a zone at which the track enters the zone."""
 
 LEAVE: Final = 0.3
-"""Probability of a zone below which a track has left it. Between the two, it stays where it was."""
+"""Probability that a track is in a zone below which the track leaves it. Between `LEAVE` and `ENTER` nothing
+changes."""
 
 MAX_CHANGES: Final = 1000
-"""Most changes that are kept for people who ask later; about 500 kB."""
+"""Largest number of changes that are kept for later requests: about 500 kB."""
 
 NS_PER_S: Final = 1_000_000_000
 
 
 @dataclass(slots=True)
 class _Stay:
-    """A track in a zone: since when, and whether it has loitered."""
+    """The stay of a track in a zone: its begin, its probability, and whether the track has loitered."""
 
     since_ns: int
     probability: float
@@ -34,14 +35,14 @@ class _Stay:
 
 
 class Presence:
-    """Follows the tracks of a run through the zones. The fusion thread writes, every thread may read `changes`.
+    """Follows the tracks of a run through the zones. Only the fusion thread calls it; every thread may read `changes`.
 
     Parameters
     ----------
     zones : callable
         Returns the zones that are in force.
     publish : callable
-        Gets the message of each change and its site time in nanoseconds.
+        Called with the message of each change and its site time in nanoseconds.
     """
 
     def __init__(self, zones: Callable[[], ZoneMap], publish: Callable[[dict[str, Any], int], None]) -> None:
@@ -53,7 +54,7 @@ class Presence:
         """The last changes, oldest first."""
 
     def take(self, track: Track, message: dict[str, Any]) -> None:
-        """Take in the new state of a track, and the message that was made of it."""
+        """Take in the new state of a track, and the message that describes it."""
         if track.state is TrackState.END:
             self._end(track.id)
             return
@@ -74,12 +75,12 @@ class Presence:
                 self._report(Change.LOITER, name, track.id, stay, found[name])
 
     def end_all(self) -> None:
-        """Let every track end: a run has ended."""
+        """End every track, because a run has ended."""
         for track in list(self._last):
             self._end(track)
 
     def _probabilities(self, zones: ZoneMap, track: Track, stays: dict[str, _Stay]) -> dict[str, float]:
-        """Return the probability of each zone that counts; a track in an excluded zone is nowhere else."""
+        """Return the probability of each zone; a track in an excluded zone counts as being in no other zone."""
         found = zones.memberships(track.position_m, track.covariance_m2)
         holding = zones.holding([float(value) for value in track.position_m])
         if zones.excluding(holding, found):
