@@ -1,7 +1,7 @@
-"""Weighs a position against its mirror images by the power there. It sees correlations and no sound.
+"""Compares a position with its mirror images by their power. It uses correlations, and no samples.
 
-The geometry of the microphones proposes places that look alike (`livessl.core.mirror`). Where another array, or a
-microphone off the plane, distinguishes them, they have less power than the position.
+`livessl.core.mirror` proposes the mirror images from the geometry of the microphones. If another array, or a microphone
+off the plane, distinguishes them from the position, they have less power.
 """
 
 from __future__ import annotations
@@ -19,14 +19,15 @@ from livessl.core.mirror import CURE, described, look_alikes
 from livessl.core.types import ArraySpec, Candidate, FloatArray
 
 SAME_POWER: Final = 0.02
-"""Margin, as a share of the power, at which another place is e times less probable. Mirror images of coplanar
-microphones have a margin of 0. Poses, geometry and sampling of the lag axis shift powers by about this much."""
+"""Margin, as a share of the power, at which another place is less probable by a factor of e. Mirror images of coplanar
+microphones have a margin of 0. Errors of poses and geometry, and the sampling of the lag axis, change powers by about
+this much."""
 
 MOST_CANDIDATES: Final = 8
-"""Most places that are reported of an ambiguous answer; on a circle around a line there are arbitrarily many."""
+"""Largest number of candidates of an ambiguous result; on a circle around a line there are infinitely many."""
 
 _NAMED: Final = 3
-"""Most other places that a reason names; `candidates` has all."""
+"""Largest number of other places in a reason; `candidates` has all places."""
 
 _LEAST_POWER: Final = 0.8
 """Power, as a share of that at the position, below which a proposed place is not refined."""
@@ -39,7 +40,7 @@ def rivals(
     power: float,
     grid: Grid,
 ) -> Rivals:
-    """Weigh a position against its `look_alikes` by the power there.
+    """Compare a position with its `look_alikes` by their power.
 
     Parameters
     ----------
@@ -77,7 +78,7 @@ def rivals(
 
 
 def _reason(others: Sequence[Candidate], specs: Sequence[ArraySpec], c_m_s: float) -> str:
-    """Return why an answer is ambiguous, and the cure, in words."""
+    """Return the reason why a result is ambiguous, and the cure, in words."""
     places = ", ".join(f"({', '.join(f'{x:.2f}' for x in each.position_m)})" for each in others[:_NAMED])
     more = f" and {len(others) - _NAMED} more" if len(others) > _NAMED else ""
     explain = "explains" if len(others) == 1 else "explain"
@@ -85,7 +86,7 @@ def _reason(others: Sequence[Candidate], specs: Sequence[ArraySpec], c_m_s: floa
 
 
 def _apart(places_m: FloatArray, values: FloatArray) -> list[int]:
-    """Indices of the highest places that are more than `NEAR_M` from each other, as many as may be reported."""
+    """Return the indices of the highest places that are more than `NEAR_M` apart, at most `MOST_CANDIDATES`."""
     chosen: list[int] = []
     for k in np.argsort(-values, kind="stable"):
         if values[k] == -np.inf or len(chosen) == MOST_CANDIDATES - 1:

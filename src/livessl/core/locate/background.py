@@ -1,7 +1,7 @@
-"""Estimates the background of a sound from the frames before it. It sees the power of frames, and their correlations.
+"""Estimates the background of a sound from the frames before it. It uses the power of frames, and their correlations.
 
-What a background adds to the evidence is known from the pre-roll. Where it is not far below the sound, frames that are
-much weaker than the loudest are mostly background, but their onsets count as much as those of loud frames.
+The pre-roll shows the part of the evidence that comes from the background. If the background is not far below the
+sound, frames that are much weaker than the loudest one are mostly background, but their onsets count as much as others.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from livessl.core.types import Float32Array
 
 FAR_BELOW: Final = 0.05
 COMPARABLE: Final = 0.1
-"""Power of a background relative to that of the sound, 13 and 10 dB below, from which on it counts, and counts in full.
-What a room still gives of an earlier sound from the same place is usually weaker."""
+"""Power of a background relative to the sound, -13 dB and -10 dB, from which the background counts, and counts in full.
+The reverberation of an earlier sound from the same place is usually weaker."""
 
 LOUD: Final = 0.3
-"""Least power of a loud frame, relative to the loudest frame of the array: 5 dB below it."""
+"""Least power of a loud frame relative to the loudest frame of the array: -5 dB."""
 
 
 class _Known(NamedTuple):
-    """Frames of the pre-roll that show the background, the first frame that may have sound, and how much it counts."""
+    """Frames of the pre-roll with the background, the first frame that may have sound, and the background's weight."""
 
     frames: list[int]
     first: int
@@ -34,16 +34,16 @@ class _Known(NamedTuple):
 
 
 def background_lags(sound: Sound, frames: int | None = None) -> Float32Array | None:
-    """Lags that frames of a sound would add up to if its background had gone on alone; None if it is not known.
+    """Return the summed lags that frames of the background alone would have; None if the background is not known.
 
-    The weights of onsets say little about power, so that a background `FAR_BELOW` the sound is left out.
+    A background that is `FAR_BELOW` the sound is ignored, because the weights of onsets say little about power.
 
     Parameters
     ----------
     sound : Sound
         The sound of one array.
     frames : int or None
-        The number of these frames; None for all from the beginning of the sound on.
+        Number of the frames; None for all frames from the beginning of the sound on.
     """
     known = _known(sound)
     if known is None:
@@ -53,7 +53,7 @@ def background_lags(sound: Sound, frames: int | None = None) -> Float32Array | N
 
 
 def loud_frames(sound: Sound) -> Sequence[int]:
-    """Return which of a sound's `onsets` are loud; none where the background is unknown, or `FAR_BELOW` the sound."""
+    """Return which of a sound's `onsets` are loud; none if the background is unknown, or `FAR_BELOW` the sound."""
     known = _known(sound)
     if known is None or sound.course is None:
         return ()
@@ -62,9 +62,9 @@ def loud_frames(sound: Sound) -> Sequence[int]:
 
 
 def _known(sound: Sound) -> _Known | None:
-    """Return what is known of the background, from the pre-roll without its last frames, in which the sound may begin.
+    """Return the background in the pre-roll, without the last frames, in which the sound may begin; None if unknown.
 
-    Envelopes are magnitudes: those of noise do not cancel, and say nothing about a place.
+    It is unknown for envelopes: these are magnitudes, which do not cancel in noise and contain no place.
     """
     course = sound.course
     if course is None or not sound.onsets:

@@ -79,16 +79,16 @@ _INFLATION: Final = 1.15
 the lag axis does not show: maps are summed with equal weight although clearer arrays deserve more."""
 
 _CALIBRATED_MISFIT: Final = 0.4
-"""Residual misfit below which most of what stands elsewhere on the lag axis is no noise but side lobes of the sound
-itself, so that the variance shrinks with its square. It is about 0.05 in free field, and 0.7 or more in a room."""
+"""Residual misfit below which the values elsewhere on the lag axis are mostly side lobes of the sound, not noise, so
+that the variance decreases with the square of the misfit. It is about 0.05 in free field, and 0.7 or more in a room."""
 
 _PLACED_M: Final = 0.0005
 """Standard deviation, in metres, with which the acoustic centres of an array's microphones are known relative to each
-other at best. Coordinates that hang on the curvature of the wavefront are no more certain than that allows."""
+other at best. Coordinates that follow from the curvature of the wavefront cannot be more exact than that."""
 
 _LEAST_DEVIATION_M: Final = 0.005
-"""Standard deviation along each axis, in metres, that remains with the clearest evidence: reflections just after the
-direct sound, which the lag axis does not resolve, move positions by that much."""
+"""Standard deviation along each axis, in metres, that remains even with the clearest evidence. Reflections just after
+the direct sound, which the lag axis does not resolve, move positions by that much."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,12 +111,12 @@ class ConfidenceFeatures:
     share : float
         Probability of the position among the places that explain the evidence about as well, such as mirror images.
     background : float
-        Share of the power at the position that the background, if it went on as it was before the sound, would have
-        there above what it may have by chance; 0 if that is not known.
+        Share of the power at the position, beyond chance, that the background would have if it continued as before the
+        sound; 0 if the background is not known.
     beginning : float or None
         `peak_to_rms` of the frames in which the sound begins; None if they are not known.
     spread_m : float
-        Greatest standard deviation of the position, metres, that its covariance gives.
+        Greatest standard deviation of the position by its covariance, metres.
     of_lines : bool
         Whether the microphones of each array lie on a line, so that no array alone gives a direction.
     """
@@ -148,14 +148,14 @@ class ConfidenceFeatures:
 
     @property
     def share_of_near_peaks(self) -> float:
-        """Share of right peaks that are nearer than `NEAR_M`; of other arrays than lines all are."""
+        """Share of right peaks that are nearer than `NEAR_M`; 1 unless the microphones of each array lie on a line."""
         if not self.of_lines:
             return 1.0
         return math.erf(NEAR_M / (math.sqrt(2.0) * _LINES_SPREAD_FIT * max(self.spread_m, 1e-9)))
 
     @property
     def weakness(self) -> float:
-        """Shortfall of the second array from a clear peak if its line of sight determines the distance; 0 otherwise."""
+        """Amount by which the second array falls short of a clear peak if it determines the distance; 0 otherwise."""
         return max(0.0, CLEAR_PEAK_TO_RMS - self.second_array) if self.crossing_deg >= CROSSING_DEG else 0.0
 
     @property
@@ -175,7 +175,7 @@ class ConfidenceFeatures:
 
     @property
     def is_sure(self) -> bool:
-        """True if another look at the sound is not worth its time."""
+        """True if a second look would hardly improve the answer: see `SURE`."""
         return self.confidence_of_candidates >= SURE and self.second_array >= CLEAR_PEAK_TO_RMS
 
     @property
@@ -195,10 +195,10 @@ class Rivals:
     candidates : tuple of Candidate
         The position, and then the other places, most probable first; their probabilities sum to 1.
     spread_m2 : (3, 3) float64
-        Second moment of the rivals nearer than `NEAR_M` about the position, square metres: they are the same answer but
-        belong into its covariance.
+        Second moment of the rivals nearer than `NEAR_M` about the position, square metres. They count as the same
+        answer, so they are added to its covariance.
     reason : str or None
-        Why there are other places, in words; None if there are none.
+        Reason, in words, for the other places; None without other places.
     """
 
     share: float
@@ -222,11 +222,11 @@ class Judgement:
         Square metres.
     features : ConfidenceFeatures
     refused : str or None
-        Why neither the position nor its `candidates` should be relied on, in words; None if they may be.
+        Reason, in words, not to rely on the position or its `candidates`; None if they can be relied on.
     candidates : tuple of Candidate
         The position and the places that explain the evidence about as well; empty if the position is clearly the best.
     ambiguity : str or None
-        Why there are candidates, in words; None without them.
+        Reason, in words, for the candidates; None without candidates.
     """
 
     covariance_m2: FloatArray
@@ -255,9 +255,9 @@ def judge(
         SRP of the evidence.
     evidence : sequence of Evidence
     position_m : (3,) float64
-        Where the functional is highest.
+        Position at which the functional is highest.
     power, rival_power : float
-        The functional there, and the highest power outside its `refine.neighbourhood`.
+        Value of the functional at the position, and the highest power outside its `refine.neighbourhood`.
     grid : Grid
         Search grid.
     whole : bool
@@ -299,7 +299,7 @@ def judge(
 
 
 def background_power(evidence: Sequence[Evidence], position_m: FloatArray, c_m_s: float) -> tuple[float, float]:
-    """Power that the background would have at a position, and its root mean square anywhere; 0 and 0 if not known."""
+    """Return the background's power at a position and its root mean square anywhere; 0 and 0 if it is not known."""
     known = [
         replace(part, gcc=replace(part.gcc, values=part.background)) for part in evidence if part.background is not None
     ]
@@ -313,7 +313,7 @@ def background_power(evidence: Sequence[Evidence], position_m: FloatArray, c_m_s
 
 
 def _background_share(evidence: Sequence[Evidence], position_m: FloatArray, power: float, c_m_s: float) -> float:
-    """Share of the power at a position that the background has there above what it may have by chance, at least 0."""
+    """Return the share of the power at a position, beyond chance, that the background has; at least 0."""
     if power <= 0.0:
         return 0.0
     there, rms = background_power(evidence, position_m, c_m_s)
@@ -321,7 +321,7 @@ def _background_share(evidence: Sequence[Evidence], position_m: FloatArray, powe
 
 
 def _beginning(evidence: Sequence[Evidence], position_m: FloatArray, c_m_s: float) -> float | None:
-    """Peak-to-RMS ratio at a position of the frames in which the sound begins; None if they are not known."""
+    """Return the peak-to-RMS ratio of the beginning at a position; None if the beginning is not known."""
     known = [part.beginning for part in evidence if part.beginning is not None]
     if not known:
         return None
@@ -336,10 +336,10 @@ def _has_line_of_sight(spec: ArraySpec, grid: Grid, c_m_s: float) -> bool:
 
 
 def _residual_misfit(evidence: Sequence[Evidence], terms: Sequence[PairTerms], axes: int) -> float:
-    """Disagreement of the pairs about a position with `axes` free coordinates, as a share of the noise; 0 to 1.
+    """Return the pairs' disagreement about a position with `axes` free coordinates, as a share of the noise; 0 to 1.
 
-    There are more delays than coordinates. Where the pairs disagree, the slopes R' of their GCCs at the position are
-    not 0. The misfit is the mean square slope, corrected for the delays that the coordinates use up, over s^2 kappa:
+    There are more delays than coordinates. If the pairs disagree, the slopes R' of their GCCs at the position are not
+    0. The misfit is the mean square slope, corrected for the delays that the coordinates use up, over s^2 kappa:
     s^2 is the mean square of the GCCs away from the peak, and kappa = sum (-R'') / sum R the mean square angular
     frequency.
     """
@@ -358,7 +358,7 @@ def _residual_misfit(evidence: Sequence[Evidence], terms: Sequence[PairTerms], a
 
 
 def crossing_deg(specs: Sequence[ArraySpec], position_m: FloatArray) -> float:
-    """Largest angle at which lines from two arrays' centres cross at a position, 0 to 90 degrees; 0 without two."""
+    """Return the largest angle between lines from two arrays to a position, 0 to 90 degrees; 0 for one array."""
     if len(specs) < 2:
         return 0.0
     lines = np.stack([position_m - spec.centre_m for spec in specs])
@@ -371,7 +371,7 @@ def _probability(log_odds: float) -> float:
 
 
 def peak_to_rms(evidence: Evidence, power: float) -> float:
-    """Peak-to-RMS ratio of one array where its SRP has this power: the power over the root mean square of its GCCs.
+    """Return the peak-to-RMS ratio of an array whose SRP has this power: the power over the RMS of its GCCs.
 
     Pairs of a dead microphone, which are all zeros, do not count.
     """
@@ -383,5 +383,5 @@ def peak_to_rms(evidence: Evidence, power: float) -> float:
 
 
 def array_power(evidence: Evidence, term: PairTerms) -> float:
-    """An array's SRP at a point, from its pairs' terms there."""
+    """Return an array's SRP at a point from the terms of its pairs there."""
     return pair_weight(len(evidence.spec.microphones_m)) * float(term.values.sum())

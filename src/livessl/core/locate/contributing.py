@@ -1,4 +1,4 @@
-"""Which arrays contribute to a position, and which show no more than their own noise would. It sees correlations only.
+"""Decides which arrays contribute to a position, and which show only noise. It uses correlations, and no samples.
 
 If the phases between the microphones are random, each pair's GCC is noise of a known standard deviation, and an array's
 SRP is a smooth random field over the directions. The probability that the highest point of such a field exceeds u
@@ -8,18 +8,18 @@ chapter 12).
     p(u) = (1 + l / (2 pi) + a u / (2 pi)^(3/2)) exp(-u^2 / 2)
 
 Here l and a are the length and the area of the directions in units of the field's correlation length. An array stands
-out if its own highest place exceeds what noise reaches in a share `FALSE_ALARMS` of all sounds. If another array stands
-out, the common place lies on that array's line of sight, and an array has to exceed only what noise reaches along a
-line, a = 0.
-An array that shows less would move the position to where its noise happens to fit, and would seem to confirm it.
+out if its own highest point exceeds the level that noise exceeds in a share `FALSE_ALARMS` of all sounds. If another
+array stands out, the common place lies on that array's line of sight, and an array has to exceed only the level for a
+line, a = 0. A weaker array would move the position to a place where its noise happens to fit, and would seem to confirm
+that place.
 
-Where at least two other arrays determine the common place, and are together far above what noise reaches anywhere, an
-array cannot move it any more. It then has to exceed only what noise reaches at a point. Pairs of microphones in a
-reverberant room rarely stand out one by one; those that do are often those that a reflection dominates.
+If at least two other arrays determine the common place, and are together far above any noise, a further array cannot
+move the place any more. It then has to exceed only the level for a point. Single pairs of microphones in a reverberant
+room rarely stand out, and those that do are often dominated by a reflection.
 
 An array that detected a sound by itself received something. If its onsets are faint (`FAINT`), it contributes although
-nothing stands out: with the others it may still determine the distance. If they are strong, they must stand out: a
-strong sound that comes from nowhere is wind, a touch, or a crackle of the electronics.
+nothing stands out, because together with the others it may still determine the distance. If the onsets are strong, they
+must stand out: a strong sound without a direction is wind, a touch, or a crackle of the electronics.
 """
 
 from __future__ import annotations
@@ -38,18 +38,19 @@ from livessl.core.locate.srp import PairTerms
 from livessl.core.types import ArraySpec, Evidence
 
 FALSE_ALARMS: Final = 1e-3
-"""Share of sounds in which an array that records nothing but noise is taken to contribute."""
+"""Share of sounds in which an array that records only noise counts as contributing."""
 
 FIXED: Final = 7.0
-"""Height of several arrays together, in standard deviations in noise, from which their place is no noise. Each of two
-arrays of 1 m has some 6000 independent directions, and noise of both reaches 7.0 in `FALSE_ALARMS` of all sounds."""
+"""Height of several arrays together, in standard deviations of noise, from which their place is not due to noise. Each
+of two arrays of 1 m has some 6000 independent directions, and noise of both reaches 7.0 in `FALSE_ALARMS` of all
+sounds."""
 
 AT_A_POINT: Final = 1.64
-"""Height of an array, in standard deviations, that its noise exceeds in 5 % of all sounds at a place that others
-fix."""
+"""Height of an array, in standard deviations, that noise exceeds in 5 % of all sounds at a place determined by
+others."""
 
 _COORDINATES: Final = 3
-"""Coordinates that arrays have to determine for their place to be fixed."""
+"""Number of coordinates that arrays must determine to determine a place."""
 
 FAINT: Final = 1.0
 """Greatest ratio of `OnsetGCC.noise_power` to its weight at which onsets are faint. With four microphones noise alone
@@ -60,16 +61,15 @@ NO_EVIDENCE: Final = "no direction stands out in the sound"
 """Reason for refusing a position if no array contributes."""
 
 _NEAR_FIELD: Final = 2.0
-"""Factor on the number of independent places, because the wave fronts of near sources are curved; found by simulated
-noise, with which the rate of false alarms is at most `FALSE_ALARMS`."""
+"""Factor on the number of independent places, because the wave fronts of near sources are curved. It was chosen with
+simulated noise so that the rate of false alarms is at most `FALSE_ALARMS`."""
 
 
 def height(evidence: Evidence, power: float) -> float:
-    """Height of an array's SRP above its mean in noise, in standard deviations that it would have in noise.
+    """Return the height of an array's SRP above its mean in noise, in standard deviations of the SRP in noise.
 
-    Of the pairs' noise two estimates are known: `Evidence.noise_rms`, which is too high where only single windows and
-    bins count, and the root mean square over all lags, which is too high where there is sound. The smaller one is
-    taken.
+    There are two estimates of the pairs' noise: `Evidence.noise_rms`, which is too high if only single windows and bins
+    count, and the root mean square over all lags, which is too high if there is sound. The smaller one is used.
     """
     values = evidence.gcc.values
     squares = np.einsum("pl,pl->p", values, values, dtype=np.float64)
@@ -93,7 +93,7 @@ def threshold(spec: ArraySpec, c_m_s: float, *, on_line: bool = False) -> float:
     c_m_s : float
         Speed of sound, m/s.
     on_line : bool
-        Whether the highest place on a line through the room is meant, instead of the highest anywhere.
+        Whether the height is that of the highest place on a line through the room, instead of anywhere.
     """
     return _threshold(spec.microphones_m.tobytes(), len(spec.microphones_m), spec.band_hz, c_m_s, on_line)
 
@@ -104,13 +104,14 @@ def contributing(
     highest_power: Callable[[Evidence], float],
     c_m_s: float,
 ) -> tuple[Evidence, ...]:
-    """Return the evidence of those arrays that contribute.
+    """Return the evidence of the contributing arrays.
 
     Parameters
     ----------
     evidence : sequence of Evidence
     terms : sequence of PairTerms
-        The arrays' terms at the highest place of all of them together; an array that stands out there needs no search.
+        The arrays' terms at their common highest place. If an array stands out there, its own place is not searched
+        for.
     highest_power : callable
         Returns the highest power of one array's own map.
     c_m_s : float
@@ -136,9 +137,9 @@ def contributing(
 
 
 def is_fixed(specs: Sequence[ArraySpec], heights: Sequence[float], without: int) -> bool:
-    """Return whether the arrays fix their common place without one of them.
+    """Return whether the arrays determine their common place without one of them.
 
-    Of its coordinates a pair of microphones determines one, another array two: the direction.
+    A pair of microphones determines one coordinate. An array of more microphones determines two: the direction.
 
     Parameters
     ----------
@@ -157,9 +158,9 @@ def is_fixed(specs: Sequence[ArraySpec], heights: Sequence[float], without: int)
 def _threshold(microphones: bytes, count: int, band_hz: tuple[float, float], c_m_s: float, on_line: bool) -> float:
     """Solve p(u) = `FALSE_ALARMS` for u.
 
-    A GCC of the band has correlation length 1/w in time, w^2 = 4 pi^2 (f1^2 + f1 f2 + f2^2)/3; with the envelope, w is
-    taken about the middle of the band. The metric of the directions is the mean over the pairs of w^2 d d^T/c^2, with d
-    the vector between two microphones.
+    A GCC of the band has correlation length 1/w in time, w^2 = 4 pi^2 (f1^2 + f1 f2 + f2^2)/3; for envelopes, w is
+    computed about the middle of the band. The metric of the directions is the mean over the pairs of w^2 d d^T/c^2,
+    with d the vector between two microphones.
     """
     positions_m = np.frombuffer(microphones, dtype=np.float64).reshape(count, 3)
     first, second = microphone_pairs(count).T

@@ -1,8 +1,8 @@
-"""The correlations of an array's sound frame by frame, and what remains of them when one source is removed.
+"""Correlates an array's sound frame by frame, and removes one source from the correlations.
 
-All pairs of an array receive a source with one spectrum, so its share of their GCCs is one even function of lag,
-shifted to each pair's delay. The mean over the pairs around their delays gives that share frame by frame. What remains
-comes from other sources, from reverberation and from noise.
+All pairs of an array receive a source with the same spectrum, so the share of the source in their GCCs is the same even
+function of lag, shifted to the delay of each pair. The mean over the pairs around their delays gives this share for
+each frame. The remainder comes from other sources, from reverberation and from noise.
 """
 
 from __future__ import annotations
@@ -21,36 +21,39 @@ from livessl.core.locate.estimator import Course
 from livessl.core.types import GCC, ArraySpec, BoolArray, Evidence, Float32Array, FloatArray, IntArray
 
 MAX_FRAMES: Final = 40
-"""Most frames that are kept apart; those of a longer sound are merged, so that memory and time do not grow with it."""
+"""Largest number of separate frames. Frames of a longer sound are merged, so that memory and time do not grow
+further."""
 
 MAX_BYTES: Final = 64 << 20
-"""Most memory, in bytes, of one array's frames that are kept apart. `MAX_FRAMES` of a tetrahedron of 0.5 m at 48 kHz
-take 1 MB. Those of a joint array of 16 microphones across a room would take hundreds, so more of them are merged."""
+"""Largest memory, in bytes, of the separate frames of one array. `MAX_FRAMES` frames of a tetrahedron of 0.5 m at 48
+kHz take 1 MB. Those of a joint array of 16 microphones across a room would take hundreds of MB, so more frames are
+merged."""
 
 LITTLE: Final = 200.0
-"""Onset weight of a frame below which it is mostly noise and counts less: noise at 10 dB gives some 30, a source in a
-clear frame thousands."""
+"""Onset weight of a frame below which the frame is mostly noise and counts less. Noise at 10 dB has about 30, a source
+in a clear frame thousands."""
 
 SAME_DELAY_S: Final = 1e-4
-"""Difference of two delays of a pair, in seconds, up to which it does not distinguish two sources: wrong geometry and
-unequal clocks shift a delay by that much, and the first source then leaves a remainder there."""
+"""Difference of two delays, in seconds, up to which a pair does not distinguish two sources. Wrong geometry and unequal
+clocks shift a delay by that much, and the first source then leaves a remainder there."""
 
 SAME_DELAY_SHARE: Final = 0.07
-"""The same for a small array, as a share of its largest delay: `SAME_DELAY_S` at an aperture of 0.5 m."""
+"""Value of `SAME_DELAY_S` for a small array, as a share of its largest delay; both are equal at an aperture of 0.5
+m."""
 
 REFLECTED: Final = 1.0
 """Height of the strongest reflection in a frame relative to that of the source itself. In a room without carpet, walls
-and a floor return a clap almost undiminished."""
+and floor reflect a clap almost without loss."""
 
 BACKGROUND: Final = 3.0
-"""Ratio of the highest remainder that a steady noise leaves in a frame to the root mean square in the pre-roll."""
+"""Ratio of the highest remainder of a steady noise in a frame to the root mean square in the pre-roll."""
 
 BEGINNING: Final = 2
-"""Last frames of the pre-roll that may hold the beginning of the sound already: the activity rule needs power, and the
-first foot of an onset has little. Its correlation is clear before that."""
+"""Number of last frames of the pre-roll in which the sound may already begin. The activity rule needs power, and the
+start of an onset has little, although its correlation is already clear."""
 
 _FITTED_DELAYS: Final = 3.0
-"""Independent delays of an array of four microphones, in units of which prominence is measured."""
+"""Number of independent delays of an array of four microphones, the unit of prominence."""
 
 
 @dataclass(frozen=True)
@@ -67,9 +70,9 @@ class FrameGCCs:
     weights : (F,) float64
         Onset weight of each frame.
     powers : (F,) float64
-        Greatest in-band mean power of the frames that each one was merged from, full scale squared.
+        Highest in-band mean power of the frames that were merged into each frame, full scale squared.
     quiet : (F,) bool
-        Whether the frame is part of the pre-roll, and not one of its last `BEGINNING`.
+        Whether the frame belongs to the pre-roll, except its last `BEGINNING` frames.
     """
 
     spec: ArraySpec
@@ -102,7 +105,7 @@ class FrameGCCs:
         return cls(spec, sampling.fine_lags_s, fine, np.array([one.weight for one in together]), powers, quiet)
 
     def without(self, delays_s: FloatArray) -> Remainder:
-        """Return what remains when a source at these delays of the pairs (P,), in seconds, is removed."""
+        """Return the remainder after a source at the delays (P,), in seconds, of the pairs is removed."""
         return Remainder(self, delays_s)
 
     @cached_property
@@ -124,7 +127,7 @@ class FrameGCCs:
 
 
 class Remainder:
-    """The remainder of an array's frames when a source is removed.
+    """The remainder of an array's frames after a source is removed.
 
     Parameters
     ----------
@@ -142,16 +145,17 @@ class Remainder:
         """Mean height over the pairs of the removed source in each frame, at least 0: (F,)."""
 
     def evidence(self) -> Evidence:
-        """Return the sum of the remainders, in which a frame counts the less the louder it is, down to `LITTLE`."""
+        """Return the sum of the remainders, in which louder frames have less weight; those below `LITTLE` are equal."""
         weights = self._frames.weights
         scale = 1.0 / np.maximum(weights, LITTLE)
         return self._summed(scale / max(float((weights * scale).sum()), 1e-9))
 
     def evidence_of(self, delays_s: FloatArray) -> Evidence:
-        """Return the sum of the remainders, in which a frame counts as far as a source at delays (P,) made it.
+        """Return the sum of the remainders, in which the weight of a frame is the share of a source at delays (P,).
 
-        The share of that source in the frame's height counts squared, beside the removed source and the root mean
-        square; it is 0 in the pre-roll. Loud frames count for more, as in the evidence of a source alone.
+        The weight is the squared share of that source in the height of the frame; the other shares are those of the
+        removed source and of the root mean square. It is 0 in the pre-roll. Loud frames count more, as in the evidence
+        of a single source.
         """
         frames = self._frames
         heights = np.where(frames.quiet, 0.0, np.maximum(self.heights(delays_s)[0], 0.0))
@@ -167,9 +171,9 @@ class Remainder:
         return Evidence(frames.spec, GCC(microphone_pairs(len(frames.spec.microphones_m)), frames.lags_s, values))
 
     def heights(self, delays_s: FloatArray) -> tuple[FloatArray, int]:
-        """Mean height in each frame of a source at delays (P,), and the number of independent delays it was taken from.
+        """Return the mean height of a source at delays (P,) in each frame, and the number of independent delays used.
 
-        Pairs that receive both sources with nearly the same delay are left out: see `SAME_DELAY_S`.
+        Pairs that receive both sources with nearly the same delay are not used: see `SAME_DELAY_S`.
         """
         frames = self._frames
         used = frames.live[np.abs(delays_s - self._delays_s)[frames.live] > self._same_s]
@@ -181,11 +185,11 @@ class Remainder:
         return heights.mean(axis=1, dtype=np.float64), independent
 
     def prominences(self, delays_s: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Prominence in each frame of a source at delays (P,), above reflections and above noise: (F,) each.
+        """Return the prominence of a source at delays (P,) in each frame, above reflections and above noise: (F,) each.
 
-        It is the mean height over the pairs, in units of what may be as high without such a source. That is the root
-        mean square of the frame, the noise that there was before the sound and, in the first of the two, reflections of
-        the removed source. It is 0 in the pre-roll.
+        Prominence is the mean height over the pairs, in units of the height that is possible without such a source. The
+        unit includes the root mean square of the frame, the noise before the sound and, in the first of the two
+        results, reflections of the removed source. Prominence is 0 in the pre-roll.
         """
         frames = self._frames
         heights, independent = self.heights(delays_s)
@@ -198,7 +202,7 @@ class Remainder:
         return above_all, above_noise
 
     def _removed(self) -> tuple[Float32Array, IntArray]:
-        """Share of the source in each frame, (F, 2 L - 1), and where in it each pair's lags begin, (P,).
+        """Return the source's share in each frame, (F, 2 L - 1), and the index at which each pair's lags begin, (P,).
 
         The share is r(t) = mean over pairs of [R_p(tau_p + t) + R_p(tau_p - t)] / 2, t as far as the lags reach.
         """

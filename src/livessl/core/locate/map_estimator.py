@@ -1,4 +1,4 @@
-"""Base class of estimators that map each array's GCC-PHAT onto one grid and sum the maps."""
+"""A base class for estimators that map each array's GCC-PHAT onto one grid and sum the maps."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from livessl.core.locate.srp import SRPMapper
 from livessl.core.types import ArraySpec, Evidence, Float32Array, FloatArray
 
 MAP_SPACING_M: Final = 0.1
-"""Finest spacing of maps that are drawn, in metres; a screen shows no finer detail of a room."""
+"""Finest spacing, in metres, of maps that are drawn; a screen shows no finer details of a room."""
 
 MAP_POINTS: Final = 1_000_000
-"""Most points of a map that is drawn: more than a screen has for one, and ten maps a second of that size can be drawn.
-A room of 8 x 10 x 4 m has a third as many at 0.1 m; a yard of 400 x 400 x 10 m is drawn at 1.2 m."""
+"""Largest number of points of a map that is drawn. A screen shows fewer, and ten maps of that size can be drawn per
+second. A room of 8 x 10 x 4 m has a third as many at 0.1 m; a yard of 400 x 400 x 10 m is drawn at 1.2 m."""
 
 MAP_BYTES: Final = 128_000_000
-"""Most memory for the look-up tables of all arrays' maps, in bytes."""
+"""Largest memory, in bytes, of the look-up tables for the maps of all arrays."""
 
 _LOWEST_CUT_OFF_HZ: Final = 100.0
 """Lowest cut-off of a limited band, in hertz, where the array's own band begins at 0 Hz."""
 
 
 class MapEstimator(ABC):
-    """An `Estimator` with everything but `locate`: GCC-PHAT of whole segments, and power maps of them.
+    """An `Estimator` without `locate`: it computes the GCC-PHAT of whole segments, and power maps from them.
 
-    A method of one's own needs one more function:
+    A subclass needs one more method:
 
     >>> class HighestGridPoint(MapEstimator):
     ...     def locate(self, sounds):
@@ -47,7 +47,7 @@ class MapEstimator(ABC):
     ----------
     arrays : sequence of ArraySpec
     grid : Grid
-        Search grid. `power_maps` draws on a coarser one if it is finer than needed or its tables would be too large.
+        Search grid. `power_maps` uses a coarser grid if this one is finer than needed or its tables would be too large.
     c_m_s : float
         Speed of sound, m/s.
     """
@@ -78,13 +78,13 @@ class MapEstimator(ABC):
         self._correlator(array, sample_rate_hz)
 
     def onset_front_end(self, array: str, sample_rate_hz: float) -> OnsetFrontEnd | None:  # noqa: ARG002 - an Estimator
-        """Return None: segments suffice."""
+        """Return None, because segments suffice."""
         return None
 
     def evidence(self, sounds: Mapping[str, Sound]) -> tuple[Evidence, ...]:
         """Correlate each array's sound; the evidence is in the order of the arrays' names.
 
-        Floating-point sums depend on their order, and the answer must not depend on the order of `sounds`.
+        Floating-point sums depend on their order, but the result must not depend on the order of `sounds`.
         """
         in_order = {name: sounds[name] for name in sorted(sounds)}
         correlators = [self._correlator(name, sound.sample_rate_hz) for name, sound in in_order.items()]
@@ -122,7 +122,7 @@ class MapEstimator(ABC):
     def _mapper(self, evidence: Evidence) -> SRPMapper:
         """Return the mapper for an array's lag axis, which changes with its sampling rate.
 
-        Evidence of an estimator with another set-up of the arrays is mapped as well, with a mapper of its own.
+        Evidence from an estimator with another set-up of the arrays gets its own mapper.
         """
         spec, gcc = evidence.spec, evidence.gcc
         is_own = spec is self.arrays.get(spec.name)
@@ -149,7 +149,7 @@ def map_grid(arrays: Sequence[ArraySpec], grid: Grid) -> Grid:
 
 
 def third_octaves_below_hz(band_hz: tuple[float, float]) -> tuple[float, ...]:
-    """Cut-offs from a band's upper edge down in steps of a third of an octave, as long as some band is left, in Hz."""
+    """Return cut-offs in Hz, in steps of a third of an octave down from a band's upper edge to its lower edge."""
     low, high = band_hz
     steps = np.arange(1, int(3.0 * np.log2(high / max(low, _LOWEST_CUT_OFF_HZ))) + 1)
     return tuple(float(cut_off) for cut_off in high * 2.0 ** (-steps / 3.0))

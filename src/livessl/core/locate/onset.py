@@ -1,4 +1,4 @@
-"""The default method: SRP of onset GCCs, with outliers, a second source, and a confidence that is a probability."""
+"""The default method `onset`: SRP of onset GCCs, without outliers, with a second source and a probability."""
 
 from __future__ import annotations
 
@@ -37,31 +37,31 @@ SEARCH_SPACING_M: Final = 0.1
 half a period almost everywhere, so no peak is missed."""
 
 MOST_ARRAYS: Final = 16
-"""Most arrays from which a sound is located, those with the strongest onsets. Further ones hardly move the position,
-and without them the cost and the delay of an answer do not grow with the number of arrays."""
+"""Most arrays from which a sound is located: those with the strongest onsets. Further arrays hardly move the position,
+and without them the time for a result does not grow with the number of arrays."""
 
 MOST_ARRAYS_REEXAMINED: Final = 8
-"""Most arrays whose whole segments are correlated where onsets are not sure; the time grows with their number."""
+"""Most arrays whose whole segments are correlated in a second look; the time grows with their number."""
 
 
 BACKGROUND: Final = 0.05
-"""Share of the power at a position that the background has there beyond chance, from which on the background is
-subtracted and the sound is looked for beneath it."""
+"""Least share of the power at a position, beyond chance, that the background must have there to be subtracted. The
+sound is then searched for in the remainder."""
 
 
 BEGAN: Final = 0.8
 """Peak-to-RMS ratio of the beginning of a sound at a position, relative to that of the whole sound, below which the
-place of the beginning is looked for: 15 % of the right positions of the development half."""
+place of the beginning is searched for. It is lower at 15 % of the right positions of the development half."""
 
 LEAD: Final = 1.0
-"""Peak-to-RMS ratio by which the beginning must be clearer at its own place than at another one to be preferred."""
+"""Difference of the beginning's peak-to-RMS ratio from which its own place is preferred to that of the whole sound."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Answer:
-    """The consensus of the arrays that contribute, its judgement, and the reason for refusing it, or None.
+    """The consensus of the contributing arrays, its judgement, and the reason for refusing it, or None.
 
-    `evidence` is that of all arrays if none contributes.
+    If no array contributes, `evidence` is that of all arrays.
     """
 
     evidence: tuple[Evidence, ...]
@@ -72,20 +72,20 @@ class _Answer:
 
     @property
     def is_sure(self) -> bool:
-        """True if a second look is not worth its time."""
+        """True if a second look would hardly improve the answer."""
         return self.refused is None and self.judgement.features.is_sure
 
     def rank(self) -> tuple[bool, bool, float]:
-        """Return what decides which of two answers is the better one: the greater is."""
+        """Return the rank of the answer: of two answers, the one with the greater rank is better."""
         return self.refused is None, len(self.contributing) > 1, self.judgement.features.confidence
 
 
 class Onset(MapEstimator):
     """SRP of onset GCCs, in which noise and reverberation have little weight (`livessl.core.correlate.onset_gcc`).
 
-    Arrays that are outliers have no part in the position (`livessl.core.locate.outliers`). The search grid is never
-    coarser than `SEARCH_SPACING_M`, and positions are refined below it, so that they do not depend on the grid of the
-    maps. The confidence is a probability, and too uncertain positions are refused (`livessl.core.locate.confidence`).
+    Outliers are excluded from the position (`livessl.core.locate.outliers`). The search grid is never coarser than
+    `SEARCH_SPACING_M`, and positions are refined below it, so that they do not depend on the grid of the maps. The
+    confidence is a probability, and positions that are too uncertain are refused (`livessl.core.locate.confidence`).
 
     Parameters
     ----------
@@ -170,9 +170,9 @@ class Onset(MapEstimator):
     def _beneath_background(
         self, evidence: tuple[Evidence, ...], suspect: Collection[str], *, tolerance: bool
     ) -> tuple[tuple[Evidence, ...], _Answer]:
-        """Answer by evidence; if the background explains the place, by what remains without it. Return what was used.
+        """Return the evidence used and the answer; if the background explains the place, the evidence without it.
 
-        Where the sound did not begin at that place, the place of its beginning is the answer.
+        If the sound did not begin at that place, the place of its beginning is the answer.
         """
         answer = self._answer(evidence, suspect, tolerance=tolerance)
         if answer.judgement.features.background >= BACKGROUND:
@@ -183,9 +183,9 @@ class Onset(MapEstimator):
         return evidence, self._by_beginning(answer, suspect)
 
     def _by_beginning(self, answer: _Answer, suspect: Collection[str]) -> _Answer:
-        """Return the place from which a sound began, if that is clear and an answer is elsewhere.
+        """Return the place at which a sound began, if it is clear and differs from the place of an answer.
 
-        From the place of the answer little or nothing came when the sound began: it is that of another source.
+        The place of the answer then emitted little or nothing when the sound began, so another source is there.
         """
         features = answer.judgement.features
         parts = tuple(part.beginning for part in answer.evidence if part.beginning is not None)
@@ -203,10 +203,10 @@ class Onset(MapEstimator):
     def _answer(
         self, evidence: tuple[Evidence, ...], suspect: Collection[str], *, whole: bool = False, tolerance: bool = True
     ) -> _Answer:
-        """Answer by sharp evidence, unless another place is more certain when clocks inside the arrays may be apart.
+        """Return the answer of sharp evidence, or that of tolerant evidence (`tolerant`) if it is more certain.
 
-        Arrays that disagree do so for another reason, and wide peaks would hide it. Where the arrays do not determine
-        the distance, the places of both differ along the line of sight.
+        If arrays disagree, the sharp evidence is used, because wide peaks would hide the disagreement. If the arrays do
+        not determine the distance, the two places differ along the line of sight.
         """
         sharp = self._answer_by(evidence, suspect, whole=whole)
         is_agreed = sharp.refused is None and not sharp.consensus.outliers
@@ -279,7 +279,7 @@ class Onset(MapEstimator):
         )
 
     def _with_candidates(self, second: Localization) -> Localization:
-        """Add the places that explain what remains for a second source as well."""
+        """Add the other places that explain the remainder of the second source about as well."""
         functional, specs = SRPFunctional(second.evidence, self.c_m_s), [part.spec for part in second.evidence]
         power = float(functional.value(second.position_m[None])[0])
         rivals = ambiguity.rivals(functional, specs, second.position_m, power, self.grid)

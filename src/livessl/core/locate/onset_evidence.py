@@ -1,4 +1,4 @@
-"""The evidence of a sound by its onsets: the GCCs of each array, with the lags of its background."""
+"""Makes the evidence of a sound from its onsets: the GCCs of each array, and the lags of its background."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ class OnsetEvidence:
     Parameters
     ----------
     arrays : mapping of str to ArraySpec
-        By name.
+        The arrays by name.
     c_m_s : float
         Speed of sound, m/s.
     prepare : callable
-        Gets the name of an array and its lags (L,) in seconds, when these are new.
+        Called with the name of an array and its lags (L,) in seconds when the lags are new.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class OnsetEvidence:
         return tuple(self._onset_evidence(name, sounds[name], first) for name in sorted(sounds))
 
     def of_loud(self, evidence: Sequence[Evidence], sounds: Mapping[str, Sound]) -> tuple[Evidence, ...] | None:
-        """Return the evidence of loud frames alone, where a background is known; None if that is the same."""
+        """Return the evidence of the loud frames alone; None if it is the same, or if no background is known."""
         loud = {part.spec.name: loud_frames(sounds[part.spec.name]) for part in evidence}
         if not any(loud.values()):
             return None
@@ -91,7 +91,7 @@ class OnsetEvidence:
         return FrameGCCs.of(evidence.spec, sampling, sound.onsets, live, sound.course)
 
     def _onset_evidence(self, array: str, sound: Sound, first: int | None) -> Evidence:
-        """Return the evidence of an array's sound; its beginning is around a frame index."""
+        """Return the evidence of an array's sound, which begins at a frame index."""
         if not sound.onsets:
             onsets = self.front_end(array, sound.sample_rate_hz).push_segments(sound.segments)
             return self._evidence_of(array, sound, onsets, None)
@@ -119,7 +119,7 @@ class OnsetEvidence:
 
 
 def without_background(evidence: Sequence[Evidence], place: Place, c_m_s: float) -> tuple[Evidence, ...]:
-    """Subtract the background, scaled so that it has all the power at a place: nothing of the place remains."""
+    """Subtract the background, scaled so that no power remains at a place."""
     there, _ = background_power(place.evidence, place.position_m, c_m_s)
     scale = np.float32(place.power / there)
 

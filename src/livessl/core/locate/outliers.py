@@ -1,9 +1,9 @@
-"""Finds the position that most arrays agree on, and the arrays that are outliers. It sees correlations and no sound.
+"""Finds the position that most arrays agree on, and the outliers. It uses correlations, and no samples.
 
-Each array's map has a highest place of its own. At the common position an array that agrees loses next to nothing of
-its peak-to-RMS ratio. An array that is turned or moved, or records something else, loses nearly all of it there, or
-makes the others lose theirs. What is lost by errors that a set-up has anyway is no disagreement: delays may be off by
-what its `livessl.core.types.Uncertainty` allows.
+The map of each array has its own highest place. At the common position, an array that agrees loses almost nothing of
+its peak-to-RMS ratio. An array that is turned or moved, or records something else, loses nearly all of its ratio there,
+or makes the others lose theirs. Errors that every set-up has are no disagreement: delays may be off by as much as
+`livessl.core.types.Uncertainty` allows.
 """
 
 from __future__ import annotations
@@ -22,33 +22,34 @@ from livessl.core.locate.srp import PairTerms
 from livessl.core.types import ArraySpec, Evidence, FloatArray, IntArray
 
 MAX_LOSS: Final = 0.8
-"""Summed loss of peak-to-RMS ratio above which arrays are taken to disagree. An array is an outlier if the loss without
-it is smaller by more than this."""
+"""Summed loss of peak-to-RMS ratio above which arrays count as disagreeing. An array is an outlier if the loss without
+it is smaller by more than this value."""
 
 MAX_UNRESOLVED_LOSS: Final = 1.5
-"""Summed loss of peak-to-RMS ratio above which a position is refused where no outlier can be named. It lies above
-`MAX_LOSS` because arrays that are all right lose that much too in noise and long reverberation."""
+"""Summed loss of peak-to-RMS ratio above which a position is refused if no outlier can be named. It is higher than
+`MAX_LOSS`, because good arrays can also lose that much in noise and long reverberation."""
 
 MAX_SUSPECT_LOSS: Final = 0.6
 """Further loss of peak-to-RMS ratio up to which a suspect array is used again."""
 
 MIN_LEAD: Final = 0.05
-"""Loss of peak-to-RMS ratio by which one outlier must explain the disagreement better than another that would lead
-elsewhere. Within it both explanations are as good: two directions may meet in a false position as well as in the right
-one."""
+"""Difference in loss of peak-to-RMS ratio by which one outlier must explain the disagreement better than another one
+that would lead to a different position. With a smaller difference both explanations are equally good, because two
+directions can also meet at a wrong position."""
 
 DEVIATIONS: Final = 2.0
-"""Standard deviations of a delay up to which arrays do not disagree."""
+"""Number of standard deviations of a delay up to which arrays do not disagree."""
 
 MAX_SHARE: Final = 0.15
-"""Most that a delay may be off, as a share of the array's largest delay: 9 degrees broadside. An array whose delays
-were known less well would agree with anything."""
+"""Largest error of a delay that is allowed, as a share of the array's largest delay: 9 degrees broadside. An array with
+less exact delays would agree with any position."""
 
 KELVIN: Final = 293.0
-"""Usual absolute temperature; the speed of sound changes by half its relative change."""
+"""Usual temperature, in kelvin; the relative change of the speed of sound is half that of the temperature."""
 
 MAX_CANDIDATES: Final = 3
-"""Most arrays that are tried as outliers in one round, those that lose most first: each costs a search."""
+"""Largest number of arrays that are tried as outliers in one round, those with the largest loss first; each takes one
+search."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,9 +60,10 @@ class Consensus:
     ----------
     place : Place
     outliers : mapping of str to float
-        Arrays that were left out of the place, and the angle in degrees between each one's own direction and the place.
+        Excluded arrays; for each, the angle in degrees between the direction it measured and the direction to the
+        place.
     refused : str or None
-        Why the place should not be relied on, in words; None if it may be.
+        Reason, in words, not to rely on the place; None if it can be relied on.
     """
 
     place: Place
@@ -126,7 +128,7 @@ def consensus(
 
 
 def _by_trust(evidence: Sequence[Evidence], suspect: Collection[str]) -> tuple[list[Evidence], list[Evidence]]:
-    """Split off the evidence of suspect arrays, unless that is half of all or more."""
+    """Split off the evidence of suspect arrays, unless half of the arrays or more are suspect."""
     trusted = [part for part in evidence if part.spec.name not in suspect]
     if 2 * len(trusted) <= len(evidence):
         return list(evidence), []
@@ -148,7 +150,7 @@ def _with_suspects(
 
 
 def _is_ambiguous(places: Sequence[Place], losses: Sequence[float], best: int) -> bool:
-    """Return whether leaving out another candidate is about as good as the best one and leads elsewhere."""
+    """Return whether excluding another candidate is about as good as excluding the best one, but changes the place."""
     return any(
         place.apart_m(places[best]) > NEAR_M
         for place, loss in zip(places, losses, strict=True)
@@ -157,7 +159,7 @@ def _is_ambiguous(places: Sequence[Place], losses: Sequence[float], best: int) -
 
 
 class _OwnPeaks:
-    """Each array's own highest place; every one is searched for when it is first needed."""
+    """The highest place of each array alone, which is searched for when it is first needed."""
 
     def __init__(self, search: PeakSearch, grid: Grid, c_m_s: float) -> None:
         self._search = search
@@ -166,11 +168,11 @@ class _OwnPeaks:
         self._highest: dict[str, tuple[float, FloatArray]] = {}
 
     def loss(self, place: Place, *, exact: bool = False) -> dict[str, float]:
-        """Peak-to-RMS ratio that each array loses at `place` against its own highest place.
+        """Return the peak-to-RMS ratio that each array loses at `place`, compared with its own highest place.
 
         Delays may be off by what the set-up allows, unless they are `exact`.
 
-        Where the sum may exceed `MAX_LOSS` the larger losses are exact; all others are upper bounds, which need no
+        If the sum may exceed `MAX_LOSS`, the larger losses are exact. All others are upper bounds, which require no
         search.
         """
         terms = place.functional.pair_terms(place.position_m)
@@ -187,7 +189,7 @@ class _OwnPeaks:
         return loss
 
     def _power(self, evidence: Evidence, term: PairTerms, place: Place) -> float:
-        """Greatest SRP of an array at a place if each pair's delay may be off by what the set-up allows."""
+        """Return the greatest SRP of an array at a place if each delay may have the error that the set-up allows."""
         values, lags_s = evidence.gcc.values, evidence.gcc.lags_s
         distance_m = float(np.linalg.norm(place.position_m - evidence.spec.centre_m))
         off_s = allowed_s(evidence.spec, evidence.gcc.pairs, term.lags_s, distance_m, self._c_m_s)
@@ -197,7 +199,7 @@ class _OwnPeaks:
         return max(array_power(evidence, term), pair_weight(len(evidence.spec.microphones_m)) * highest)
 
     def angle_deg(self, evidence: Evidence, position_m: FloatArray) -> float:
-        """Angle at an array between its own highest place and a position, in degrees."""
+        """Return the angle, in degrees, at an array between its own highest place and a position."""
         centre_m = evidence.spec.centre_m
         return angle_deg(self._at(evidence)[1] - centre_m, position_m - centre_m)
 
@@ -210,7 +212,7 @@ class _OwnPeaks:
 
 
 def allowed_s(spec: ArraySpec, pairs: IntArray, delays_s: FloatArray, distance_m: float, c_m_s: float) -> FloatArray:
-    """Greatest amount by which delays (P,) may be off if the set-up is right, in seconds: (P,).
+    """Return the greatest error (P,), in seconds, that delays (P,) may have if the set-up is right.
 
     Parameters
     ----------
@@ -233,7 +235,7 @@ def allowed_s(spec: ArraySpec, pairs: IntArray, delays_s: FloatArray, distance_m
 
 
 def _upper_bound(evidence: Evidence) -> float:
-    """Peak-to-RMS ratio that no place exceeds: that of all of an array's pairs at their highest lag."""
+    """Return the highest possible peak-to-RMS ratio: that of all of an array's pairs at their highest lag."""
     highest = evidence.gcc.values.max(axis=1).sum(dtype=np.float64)
     return peak_to_rms(evidence, pair_weight(len(evidence.spec.microphones_m)) * float(highest))
 

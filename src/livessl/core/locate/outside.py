@@ -1,8 +1,8 @@
-"""Decides whether a sound came from outside the search volume. It sees correlations and no sound.
+"""Decides whether a sound came from outside the search volume. It uses correlations, and no samples.
 
-The search ends at the volume's surface, so a sound from beyond it is placed on the surface, or at a place inside where
-all arrays find some power. Both have less power than the true place. It is searched for along the direction from which
-each array receives the sound, beyond the volume.
+The search ends at the surface of the volume. A sound from beyond the surface is therefore located on the surface, or at
+a place inside at which all arrays have some power. Both places have less power than the true one, which is searched for
+beyond the volume, along the direction from which each array receives the sound.
 """
 
 from __future__ import annotations
@@ -22,54 +22,57 @@ from livessl.core.locate.srp import SRPFunctional
 from livessl.core.types import Candidate, Evidence, FloatArray
 
 GAIN: Final = 0.1
-"""Power that a place outside must have more than the best place inside, as a share of that. Of sounds outside, the
-middle half has 0.1 to 0.3; noise and reverberation of sounds inside reach 0.04, also after 2 s of reverberation."""
+"""Least amount by which the power of a place outside must exceed that of the best place inside, as a share of the
+latter. It is 0.1 to 0.3 for the middle half of sounds outside. For sounds inside, noise and reverberation reach 0.04,
+even with a reverberation time of 2 s."""
 
 SURFACE_GAIN: Final = 0.005
-"""The same where the best place inside lies on the volume's surface: the power rises only a little along the line of
-sight of arrays that are in line with the sound. Reflections by a wall move places less than `NEAR_M`."""
+"""Value of `GAIN` if the best place inside lies on the surface of the volume. The power rises only a little along the
+line of sight of arrays that are in line with the sound. Reflections by a wall move places by less than `NEAR_M`."""
 
 POSE_DEG: Final = 1.5
-"""Standard deviation, in degrees, of an array's pose: that of a mount aligned by eye and measuring tape."""
+"""Standard deviation, in degrees, of an array's orientation if it is aligned by eye and measuring tape."""
 
 MOST_DEVIATIONS: Final = 2.5
-"""Deviations of the poses, over all arrays, up to which they explain why a place inside looks as if outside."""
+"""Number of standard deviations of the poses, over all arrays, up to which wrong poses explain an outside place."""
 
 NEAR_BY_POSE_M: Final = 1.25
-"""Distance, in metres, between the places inside and outside up to which the one inside is kept if poses explain it.
-Beyond, the arrays do not measure the distance well enough to exclude the one outside."""
+"""Distance, in metres, between the places inside and outside up to which the place inside is kept if poses explain the
+difference. If they are farther apart, the arrays do not measure the distance well enough to exclude the place
+outside."""
 
 SUFFICIENT: Final = 0.95
-"""Power, as a share of the highest that the evidence can have anywhere, with which one place explains the evidence so
-well that no second source is needed."""
+"""Least power of a place, as a share of the highest possible power of the evidence, at which the place explains the
+evidence so well that no second source is needed."""
 
 _DIRECTIONS: Final = 1600
-"""Directions examined for each array, some 5 degrees apart: a lobe of an array of 0.5 m is about as wide."""
+"""Number of directions examined for each array, about 5 degrees apart: the width of a lobe of an array of 0.5 m."""
 
 _CLOSER_DEG: Final = (3.0, 1.0)
-"""Half widths, in degrees, of two finer looks around the best direction."""
+"""Half widths, in degrees, of the two finer searches around the best direction."""
 
 _CLOSER_STEPS: Final = 9
-"""Directions along each axis of a finer look."""
+"""Number of directions along each axis of a finer search."""
 
 _FARTHEST_DIAGONALS: Final = 3.0
-"""Distance from an array up to which places are examined, in diagonals of it. Beyond, only the direction counts."""
+"""Greatest distance of examined places from an array, in diagonals of the volume. Farther away, only the direction
+matters."""
 
 _NEAREST_M: Final = 0.3
 """Shortest distance, in metres, that is examined along each direction."""
 
 _DISTANCES: Final = 100
-"""Distances examined along each direction, in equal ratios of some 5 %: from two arrays metres apart, neighbours differ
-by less than a lobe."""
+"""Number of distances examined along each direction, in equal ratios of about 5 %. For two arrays some metres apart,
+neighbouring distances differ by less than a lobe."""
 
 MOST_DIRECTIONS: Final = 4
-"""Most arrays along whose directions places are examined, those that receive the sound most clearly."""
+"""Largest number of arrays along whose directions places are examined: those that receive the sound most clearly."""
 
 _PROMISING: Final = 0.9
-"""Power along these directions, as a share of that needed, below which refining cannot reach it."""
+"""Highest power along these directions, as a share of the required power, below which no place is refined."""
 
 _REFINED_M: Final = 0.5
-"""Edge, in metres, of the cells in which places outside are refined; four times the longest step of the climb."""
+"""Edge, in metres, of the cells in which places outside are refined: four times the longest step of a climb."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,9 +82,9 @@ class Outside:
     Parameters
     ----------
     place : Place
-        Its `rival_power` is the power of the place inside.
+        Place outside; its `rival_power` is the power of the place inside.
     grid : Grid
-        A box that holds the search volume and the place, in which to judge it.
+        A box that contains the search volume and the place, in which the place is judged.
     surface : bool
         Whether the place inside lies on the surface, so that the sound may be there.
     """
@@ -103,7 +106,7 @@ class Outside:
 
     @property
     def reason(self) -> str:
-        """The answer in words."""
+        """The reason in words."""
         near = ", ".join(f"{x:.1f}" for x in self.place.position_m)
         where = (
             "at the surface of the search volume or outside the search volume"
@@ -126,13 +129,13 @@ def find_outside(
     inside : Place
         The best place inside.
     evidence : sequence of Evidence
-        Evidence of all arrays, also of those that do not agree on the place inside.
+        Evidence of all arrays, including outliers with respect to the place inside.
     grid : Grid
         Search grid.
     c_m_s : float
         Speed of sound, m/s.
     refused : bool
-        Whether the place inside is not relied on anyway; then its being on the surface says nothing.
+        Whether the place inside is refused; its position on the surface then has no meaning.
     """
     if len(grid.free_axes) < 3 or len(evidence) < 2:
         return None  # sounds off a plane that is searched look far away in it; one array measures no distance
@@ -160,7 +163,7 @@ def find_outside(
 
 
 def highest_power(evidence: Sequence[Evidence]) -> float:
-    """Power that no place exceeds: that of all pairs at their highest lag."""
+    """Return the highest possible power: that of all pairs at their highest lag."""
     return sum(
         pair_weight(len(part.spec.microphones_m)) * float(part.gcc.values.max(axis=1).sum(dtype=np.float64))
         for part in evidence
@@ -168,7 +171,7 @@ def highest_power(evidence: Sequence[Evidence]) -> float:
 
 
 def _is_near(place_m: FloatArray, inside_m: FloatArray, evidence: Sequence[Evidence]) -> bool:
-    """Return whether a place outside is the same answer as one inside, given how well the poses of arrays are known."""
+    """Return whether a place outside and one inside are the same answer, given the uncertainty of the arrays' poses."""
     turns_deg = [angle_deg(place_m - part.spec.centre_m, inside_m - part.spec.centre_m) for part in evidence]
     by_pose = float(np.linalg.norm(turns_deg)) <= MOST_DEVIATIONS * POSE_DEG
     return float(np.linalg.norm(place_m - inside_m)) <= (NEAR_BY_POSE_M if by_pose else NEAR_M)
@@ -186,7 +189,7 @@ def _widened(grid: Grid) -> Grid:
 
 
 def _along_m(part: Evidence, grid: Grid, c_m_s: float) -> FloatArray:
-    """Places (N, 3) outside the volume along the direction from which an array receives the sound, from far away."""
+    """Return places (N, 3) outside the volume along the direction from which an array receives a far sound."""
     functional, centre_m = SRPFunctional([part], c_m_s), part.spec.centre_m
     far_m = _FARTHEST_DIAGONALS * float(np.linalg.norm(grid.upper_m - grid.lower_m))
 
@@ -201,7 +204,7 @@ def _along_m(part: Evidence, grid: Grid, c_m_s: float) -> FloatArray:
 
 
 def _around(direction: FloatArray, half: float) -> FloatArray:
-    """Unit vectors (N, 3) on a square around a direction, `half` radians to each side."""
+    """Return unit vectors (N, 3) on a square around a direction, `half` radians to each side."""
     across = np.linalg.svd(direction[None])[2][1:]
     steps = np.linspace(-half, half, _CLOSER_STEPS)
     one, other = np.meshgrid(steps, steps)
@@ -210,7 +213,7 @@ def _around(direction: FloatArray, half: float) -> FloatArray:
 
 
 def _sphere() -> FloatArray:
-    """Unit vectors (N, 3) that cover the sphere evenly: a Fibonacci lattice."""
+    """Return unit vectors (N, 3) that cover the sphere evenly: a Fibonacci lattice."""
     index = np.arange(_DIRECTIONS) + 0.5
     height = 1.0 - 2.0 * index / _DIRECTIONS
     azimuth = np.pi * (1.0 + np.sqrt(5.0)) * index

@@ -1,10 +1,11 @@
-"""The highest points of the summed power maps, exactly, without the maps: branch and bound over cells of the grid.
+"""Finds the highest points of the summed power maps exactly, without the maps, by branch and bound over grid cells.
 
-Over a cell of the grid each pair's delay lies in an interval. The maximum of its GCC over that interval bounds what the
-pair can add at any point of the cell, and the sum of these maxima bounds the cell. A cell whose bound is below the best
-power known can be skipped (in the spirit of Nunes et al., IEEE TSP 2014, but with a bound that proves the answer).
-Usually about 2000 points out of millions are visited. Where nothing stands out most cells are, and the search takes
-longer, but never much longer than the map. Memory is bounded whatever the grid (`livessl.core.locate.search_cubes`).
+Over a cell of the grid each pair's delay lies in an interval. The maximum of its GCC over that interval is an upper
+bound of the pair's value at any point of the cell. The sum of these maxima is an upper bound for the cell, and a cell
+whose bound is below the best known power can be skipped (in the spirit of Nunes et al., IEEE TSP 2014, but with a bound
+that proves the result). Usually about 2000 points out of millions are visited. If nothing stands out, most cells are
+visited, and the search takes longer, but never much longer than computing the map. Memory is bounded for every grid
+(`livessl.core.locate.search_cubes`).
 """
 
 from __future__ import annotations
@@ -35,10 +36,10 @@ from livessl.core.types import (
 
 _ROUNDING: Final = 8e-6
 """Largest difference, relative to the sum of all pairs' greatest values, between sums over at most 64 arrays in
-different orders: two times 64 roundings of 6e-8. Where a sum is great, what is negative in it is less."""
+different orders: two times 64 roundings of 6e-8. Large sums have few negative terms."""
 
 _CUBES_AT_ONCE: Final = 512
-"""Cubes whose tables are computed at once, to bound the memory of doing so."""
+"""Number of cubes whose tables are computed at one time, to limit the memory that this takes."""
 
 
 class PeakSearch:
@@ -128,7 +129,7 @@ class PeakSearch:
         Parameters
         ----------
         evidence : sequence of Evidence
-            At least one, in the order in which the maps are to be summed. Each array must have been prepared.
+            At least one item, in the order in which the maps are summed. Each array must have been prepared.
         """
         if self._kernels is not kernels.in_use:
             self._kernels = kernels.in_use
@@ -214,13 +215,13 @@ class _Among:
     Parameters
     ----------
     lags : int
-        Lags of the longest row.
+        Number of lags of the longest row.
     runs : int
-        Places among the running maxima of a row that cells may refer to, in whole levels.
+        Number of places among the running maxima of a row to which cells may refer, in whole levels.
     reaches : int
-        How many of the `REACHES` cells may refer to.
+        Number of the `REACHES` to which cells may refer.
     block : (R,) int64
-        Lags in a block of each row.
+        Number of lags in a block of each row.
     rows : SearchRows
     """
 
@@ -245,12 +246,12 @@ class _Buffer:
 
 
 def block_lags(lags: int) -> int:
-    """Lags in a block of an axis with so many lags."""
+    """Return the number of lags in a block of an axis with `lags` lags."""
     return -(-lags // BLOCKS)
 
 
 def run_places(low: UInt16Array, high: UInt16Array, block: int) -> UInt16Array:
-    """Place among the running maxima of the shortest run that begins in the block of `low` and holds `high`."""
+    """Return the place, among the running maxima, of the shortest run from the block of `low` that contains `high`."""
     first = low // block
     return np.asarray(_PLACE_OF_LENGTH[high // block - first + 1] + first)
 
@@ -259,13 +260,13 @@ _PLACE_OF_LENGTH: Final = np.array([BLOCKS * np.searchsorted(RUNS, blocks) for b
 """Place among the running maxima of the first run of each length, in blocks."""
 
 _SETS: Final = 16
-"""Sets of arrays whose rows are kept ready."""
+"""Number of sets of arrays whose rows are cached."""
 
 
 def warm_up() -> None:
-    """Run every kernel once, so that nothing is compiled, or read from the compiler's cache, while a user waits.
+    """Run every kernel once, so that no kernel is compiled, or read from the compiler's cache, while a user waits.
 
-    The first time on a machine this takes some seconds, later a fraction of one.
+    The first call on a machine takes some seconds, later calls a fraction of a second.
     """
     spec = ArraySpec("warm-up", np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]]), (100.0, 6000.0))
     grid = Grid(((0.0, 1.0), (0.0, 1.0), (0.0, 1.0)), 0.5)

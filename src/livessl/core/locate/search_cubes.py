@@ -1,4 +1,4 @@
-"""Divides a grid into the cubes of a peak search: every point in a room, fewer points far from all arrays in a yard.
+"""Divides a grid into the cubes of a peak search: all points in a room, but fewer points far from all arrays in a yard.
 
 Far from an array its delays change little from one grid point to the next. In a volume with more points than can be
 examined, a cube far from all arrays holds only every second, fourth, … point along each axis. The number of points
@@ -17,30 +17,31 @@ from livessl.core.geometry import Grid
 from livessl.core.types import ArraySpec, FloatArray, IntArray
 
 MOST_POINTS: Final = 5_000_000
-"""Most points of a grid that are all examined. A room of 8 x 10 x 4 m at 0.05 m has half as many; with more, one search
-in noise could not keep up with live sound."""
+"""Largest number of grid points that are all examined. A room of 8 x 10 x 4 m at 0.05 m has half as many. With more
+points, a search in noise could not keep up with live sound."""
 
 FAR_PERIODS: Final = 0.25
-"""Most by which the delay of an array changes from one examined point to the next, in periods of the upper end of its
-band, where points are left out. At 0.1 m it changes by as much 7 m from an array of 0.5 m, and by more nearer to it."""
+"""Largest change of an array's delay from one examined point to the next, in periods of the upper edge of its band, if
+points are skipped. With a spacing of 0.1 m, the delay changes by this much 7 m away from an array of 0.5 m, and by more
+near the array."""
 
 CELL_M: Final = 0.2
-"""Approximate edge of a cell, in metres, where all points are examined; larger where there would be more than
-`MOST_CELLS`."""
+"""Approximate edge of a cell, in metres, if all points are examined; it is larger if there would be more than
+`MOST_CELLS` cells."""
 
 MOST_CELLS: Final = 100_000
 """Approximate number of cells above which cells become larger, to bound the memory of the tables."""
 
 CELLS_PER_CUBE: Final = 4
-"""Cells along the edge of a cube."""
+"""Number of cells along the edge of a cube."""
 
 _COARSER: Final = 1.25
-"""Factor by which `FAR_PERIODS` grows as long as there are more than `MOST_POINTS` points."""
+"""Factor by which `FAR_PERIODS` is increased, repeatedly, while there are more than `MOST_POINTS` points."""
 
 
 @dataclass(frozen=True, slots=True)
 class SearchCubes:
-    """Cubes that together hold all points that a search examines.
+    """Cubes that together contain all points that a search examines.
 
     Parameters
     ----------
@@ -49,7 +50,7 @@ class SearchCubes:
     strides : (T,) int64
         Distance between neighbouring points of each cube, in grid points.
     edge : int
-        Points along the edge of a cell.
+        Number of points along the edge of a cell.
     """
 
     corners: IntArray
@@ -58,7 +59,7 @@ class SearchCubes:
 
     @property
     def points(self) -> int:
-        """Points along the edge of a cube."""
+        """Number of points along the edge of a cube."""
         return self.edge * CELLS_PER_CUBE
 
     def stride_at(self, point: IntArray) -> int:
@@ -69,7 +70,7 @@ class SearchCubes:
 
 
 def search_cubes(arrays: Sequence[ArraySpec], grid: Grid, c_m_s: float) -> SearchCubes:
-    """Divide a grid into cubes: with all its points if there are at most `MOST_POINTS`, or else with fewer far away."""
+    """Divide a grid into cubes: with all points if there are at most `MOST_POINTS`, otherwise with fewer far away."""
     if grid.size <= MOST_POINTS:
         volume = float(np.prod(np.maximum(grid.upper_m - grid.lower_m, CELL_M)))
         edge = max(2, round(max(CELL_M, (volume / MOST_CELLS) ** (1 / 3)) / grid.spacing_m))

@@ -1,8 +1,8 @@
-"""Finds a second source that sounds at the same time, after removing from the evidence what the first one explains.
+"""Finds a second source that sounds at the same time, after the part of the first source is removed from the evidence.
 
-What remains without the first source (`livessl.core.locate.frame_gccs`) comes from a second one, from reverberation of
-the first, or from noise that was there before. A second source stands out from all of these in some frame, at more than
-half of the arrays, and is the highest place of all that remains.
+The remainder (`livessl.core.locate.frame_gccs`) comes from a second source, from reverberation of the first source, or
+from noise that was there before. A second source is the highest place of the remainder, and stands out from
+reverberation and noise in some frame at more than half of the arrays.
 """
 
 from __future__ import annotations
@@ -27,26 +27,26 @@ from livessl.core.locate.srp import SRPFunctional
 from livessl.core.types import Evidence, FloatArray
 
 APART_M: Final = 1.0
-"""Distance, in metres, below which two places are one source."""
+"""Distance, in metres, below which two places count as one source."""
 
 MOST_ARRAYS_SEPARATED: Final = 8
-"""Most arrays used to separate two sources; the time it takes is in proportion to their number."""
+"""Largest number of arrays used to separate two sources; the time is proportional to their number."""
 
 CANDIDATES: Final = 6
-"""Places examined for each source; the right one is hardly ever further down."""
+"""Number of places examined for each source; the right one is hardly ever lower in the order."""
 
 CANDIDATES_APART_M: Final = 0.5
 """Least distance between candidates along one of the axes, in metres."""
 
 LEAST_PROSPECT: Final = 0.1
-"""Confidence at first sight below which a second source is not examined further."""
+"""Confidence of the first estimate below which a second source is not examined further."""
 
 CLEAR: Final = 1.0
-"""Prominence of the second source in a frame from which the frame's power is divided between both sources; below it the
-remainder may be reflections."""
+"""Prominence of the second source in a frame from which the power of the frame is divided between both sources. Below
+it, the remainder may be reflections."""
 
 UNEXPLAINED: Final = 0.05
-"""Share of the height of the pairs' GCCs that a source may leave unexplained because the lag axis is sampled."""
+"""Share of the height of the pairs' GCCs that a source may leave unexplained, because the lag axis is sampled."""
 
 _FIT: Final = (-10.16, 4.06, 1.91, 6.71, 0.97)
 """Log-odds of a second source at a place: intercept and the weights of `SecondSourceFeatures.terms`. Fitted by
@@ -60,14 +60,15 @@ class SecondSourceFeatures:
     Parameters
     ----------
     above_all, above_noise : float
-        Means over the arrays of each one's greatest prominence in a frame, above reflections and noise and above noise
-        alone (`livessl.core.locate.frame_gccs.Remainder.prominences`). In the frames of a source of its own the first
-        one is weak and both are nearly equal; reflections of the first come with it.
+        Greatest prominence in a frame, above reflections and noise and above noise alone
+        (`livessl.core.locate.frame_gccs.Remainder.prominences`); mean over the arrays. In the frames of a real second
+        source the first source is weak, and both values are nearly equal. Reflections occur together with the first
+        source.
     margin : float
-        1 - (power at the best other place) / (power at the place), of the evidence of the second source.
+        1 - (power at the best other place) / (power at the place), in the evidence of the second source.
     explained : float
-        Mean over the arrays of the height of its pairs' GCCs at the place, relative to the highest that each of them
-        has anywhere. All pairs of all arrays receive a source; of a place where reflections happen to meet, some do.
+        Height of the pairs' GCCs at the place, relative to the highest value that each of them has anywhere; mean over
+        the arrays. All pairs of all arrays receive a source; only some receive reflections that meet at a place.
     """
 
     above_all: float
@@ -77,7 +78,7 @@ class SecondSourceFeatures:
 
     @property
     def terms(self) -> FloatArray:
-        """Terms of the log-odds, without the intercept: (4,). Each halving of what is not explained counts alike."""
+        """Terms of the log-odds without the intercept, (4,). Each halving of the unexplained share adds the same."""
         unexplained = max(0.0, 1.0 - self.explained) + UNEXPLAINED
         return np.array([self.above_all, self.above_noise, self.margin, -np.log(unexplained)])
 
@@ -89,13 +90,13 @@ class SecondSourceFeatures:
 
 
 def majority(of_arrays: Sequence[float]) -> float:
-    """Mean of the prominences at more than half of the arrays, the greatest ones."""
+    """Return the mean of the greatest prominences, those of just more than half of the arrays."""
     return float(np.mean(sorted(of_arrays)[-(len(of_arrays) // 2 + 1) :]))
 
 
 @dataclass(frozen=True, slots=True)
 class TwoSources:
-    """Two places at which sources may have sounded at the same time, and what shows whether the second is a source."""
+    """Two places at which sources may have sounded at the same time, and the features of the second source."""
 
     first: Place
     second: Place
@@ -109,7 +110,7 @@ class TwoSources:
 
 @dataclass(frozen=True, slots=True)
 class Separation:
-    """The answers for two sources that sounded at the same time: the first as a place, to be published as the main one.
+    """The answers for two sources that sounded at the same time. The first one is published as the main source.
 
     Parameters
     ----------
@@ -117,7 +118,7 @@ class Separation:
     judgement : Judgement
         Judgement of the first place.
     power : float or None
-        Greatest in-band power of a frame that the first source has, full scale squared; None if it is unknown.
+        Highest in-band frame power attributed to the first source, full scale squared; None if it is unknown.
     second : Localization
     """
 
@@ -153,9 +154,9 @@ class SecondSourceSearch:
     ) -> Separation | None:
         """Separate two sources that sound at the same time; None if there is no second one.
 
-        Arrays may disagree because they receive different sources best, so the second source is searched for in all
-        evidence first, and then in that of the arrays that agree. If all arrays have a peak at both places, none is an
-        outlier.
+        Arrays may disagree because they receive different sources best. The second source is therefore searched for in
+        all evidence first, and then in the evidence of the arrays that agree. If all arrays have a peak at both places,
+        no array is an outlier.
 
         Parameters
         ----------
@@ -181,7 +182,7 @@ class SecondSourceSearch:
         return None
 
     def _at_the_place(self, place: Place, evidence: tuple[Evidence, ...]) -> Place:
-        """Return a place with its power, and that of its rival, in the maps of other arrays than it was found by."""
+        """Return a place with its power and its rival's power in the maps of arrays that did not find it."""
         if [part.spec.name for part in evidence] == [part.spec.name for part in place.evidence]:
             return place
         functional = SRPFunctional(evidence, self._c_m_s)
@@ -192,9 +193,9 @@ class SecondSourceSearch:
     def _separation(
         self, consensus: Consensus, found: TwoSources, frames: Sequence[FrameGCCs], *, keeps_first: bool
     ) -> Separation:
-        """Judge both places. With `keeps_first` the consensus remains the first place if that is more confident.
+        """Judge both places. With `keeps_first` the consensus remains the first place if it has the higher confidence.
 
-        Equalising the frames weakens a short first source.
+        Equalising the frames makes a short first source weaker.
         """
         places = [found.first]
         if keeps_first and consensus.place.apart_m(found.second) >= APART_M:
@@ -235,9 +236,9 @@ class SecondSourceSearch:
     def most_likely(self, first: Place, frames: Sequence[FrameGCCs]) -> TwoSources:
         """Return the most likely pair of places, whether or not there is a second source.
 
-        The first source is removed and the second searched for; with the second removed the first is searched for
-        again, and then the second once more. If the first would then be elsewhere, both stay where they were found. If
-        there is hardly a second source at first sight, it is not examined further.
+        The second source is searched for after the first is removed, then the first after the second is removed, and
+        then the second again. If the first source would move to another place, both results of the first round remain.
+        If the first estimate of the second source has a low confidence, it is not examined further.
 
         Parameters
         ----------
@@ -255,7 +256,7 @@ class SecondSourceSearch:
         return TwoSources(first, second, features)
 
     def beside(self, place: Place, frames: Sequence[FrameGCCs]) -> tuple[Place, SecondSourceFeatures]:
-        """Return the most likely other place with the source at `place` removed, and what shows whether it is a source.
+        """Return the most likely other place after the source at `place` is removed, and its features.
 
         Of the candidates with the highest power, the one with the highest product of power and prominence wins.
         """
@@ -269,7 +270,7 @@ class SecondSourceSearch:
         return chosen, SecondSourceFeatures(above_all, above_noise, margin, _explained(chosen))
 
     def _highest(self, evidence: tuple[Evidence, ...]) -> Place:
-        """Search for the highest place of some evidence; one climb suffices, as no other answer is compared with it."""
+        """Search for the highest place of some evidence with one climb; it is not compared with other answers."""
         find, functional = self._search.among(evidence), SRPFunctional(evidence, self._c_m_s)
         position_m, power = refine.refine_peaks(functional, find(1), self._grid)
         return Place(evidence, functional, position_m, power, refine.rival_power(find, self._grid, position_m))
@@ -295,28 +296,29 @@ class SecondSourceSearch:
 
 
 def _explained(place: Place) -> float:
-    """Mean over the arrays of the power at a place relative to the highest that each one's pairs can have."""
+    """Return the power at a place relative to the highest possible power of an array's pairs; mean over the arrays."""
     terms = place.functional.pair_terms(place.position_m)
     each = zip(place.evidence, terms, strict=True)
     return float(np.mean([array_power(part, term) / max(highest_power([part]), 1e-9) for part, term in each]))
 
 
 def _prominences(remainders: Sequence[Remainder], place: Place) -> list[tuple[float, float]]:
-    """Greatest prominence in a frame of each array, above reflections and noise and above noise alone."""
+    """Return each array's greatest prominence in a frame, above reflections and noise and above noise alone."""
     of_frames = [each.prominences(delays_s) for each, delays_s in zip(remainders, _delays_s(place), strict=True)]
     return [(float(above_all.max()), float(above_noise.max())) for above_all, above_noise in of_frames]
 
 
 def _delays_s(place: Place) -> list[FloatArray]:
-    """Delays of each array's pairs (P,) at a place, in seconds."""
+    """Return the delays of each array's pairs (P,) at a place, in seconds."""
     return [term.lags_s for term in place.functional.pair_terms(place.position_m)]
 
 
 def _powers(first: Place, second: Place, frames: Sequence[FrameGCCs]) -> tuple[float | None, float | None]:
-    """Greatest power of a frame that each source has, full scale squared; None if it is unknown.
+    """Return the highest frame power attributed to each source, full scale squared; None if it is unknown.
 
-    A frame's power is divided in proportion to the heights of both where the second source is clear, and belongs to the
-    first one elsewhere. A second source that is clear in no frame gets its share of every frame instead.
+    In frames in which the second source is clear, the power is divided in proportion to the heights of both sources. In
+    other frames all power belongs to the first source. If the second source is clear in no frame, the power of every
+    frame is divided.
     """
     of_first, of_second, unclear = 0.0, 0.0, 0.0
     for each, first_s, second_s in zip(frames, _delays_s(first), _delays_s(second), strict=True):
@@ -332,9 +334,10 @@ def _powers(first: Place, second: Place, frames: Sequence[FrameGCCs]) -> tuple[f
 
 
 def _separable(evidence: Sequence[Evidence], sounds: Mapping[str, Sound]) -> tuple[Evidence, ...]:
-    """Return the evidence with the strongest onsets, from which two sources may be separated; empty if they may not.
+    """Return the evidence with the strongest onsets for separating two sources; empty if they cannot be separated.
 
-    It takes two arrays, `sources` > 1 and onsets. Envelopes do not qualify: magnitudes of two sources do not add up.
+    Separation requires two arrays, `sources` > 1 and onsets. It does not work with envelopes, because the magnitudes of
+    two sources do not add up.
     """
     strongest = strongest_onsets({part.spec.name: sounds[part.spec.name] for part in evidence}, MOST_ARRAYS_SEPARATED)
     used = tuple(part for part in evidence if part.spec.name in strongest)

@@ -1,4 +1,4 @@
-"""The paper's standard, SRP-PHAT, and two variants of it with another front end."""
+"""The paper's standard method, SRP-PHAT, and two variants with another front end."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from livessl.core.steering import alias_free_hz
 from livessl.core.types import ArraySpec, Evidence
 
 _SAMPLED_POINTS: Final = 4096
-"""Grid points, about, at which is checked whether a band limit matters."""
+"""Approximate number of grid points at which the effect of a band limit is checked."""
 
 
 class SrpPhat(MapEstimator):
-    """The paper's standard: GCC-PHAT over whole segments, mapped and summed over the arrays.
+    """The paper's standard method: GCC-PHAT of whole segments, mapped and summed over the arrays.
 
     Parameters
     ----------
@@ -35,11 +35,11 @@ class SrpPhat(MapEstimator):
     c_m_s : float
         Speed of sound, m/s.
     band_limit : bool or None
-        Whether the band is limited per pair and grid point against spatial aliasing. None limits it for those arrays of
-        which more than half of all pairs and points of the map would lose part of the band. That is so for an array of
-        0.5 m on a 0.5 m grid, but not on a 0.1 m grid, where the answer would hardly change. If the band of any array
-        in a sound is limited, the peak is read from the map; otherwise it is searched for on the grid, which may be
-        finer.
+        Whether the band is limited for each pair and grid point to prevent spatial aliasing. None limits it for arrays
+        for which more than half of all pairs and points of the map would lose part of the band. This is the case for an
+        array of 0.5 m on a grid of 0.5 m, but not on a grid of 0.1 m, on which the result would hardly change. If the
+        band of any array of a sound is limited, the peak is read from the map. Otherwise the peak is searched for on
+        the grid, which may be finer.
     """
 
     name = SRP_PHAT
@@ -52,7 +52,7 @@ class SrpPhat(MapEstimator):
         self._search = PeakSearch(arrays, grid, c_m_s)
 
     def locate(self, sounds: Mapping[str, Sound]) -> Localization:
-        """Find the highest grid points of the arrays' summed maps, refine them below the grid, and take the best."""
+        """Find the highest grid points of the summed maps, refine them between grid points, and return the best."""
         evidence = self.evidence(sounds)
         in_map = any(self._limited[name] for name in sounds)
         grid = self._map_grid if in_map else self.grid
@@ -71,7 +71,7 @@ class SrpPhat(MapEstimator):
         )
 
     def evidence(self, sounds: Mapping[str, Sound]) -> tuple[Evidence, ...]:
-        """Correlate each array's sound, over its limited bands too where a band is limited."""
+        """Correlate each array's sound, also over its limited bands if its band is limited."""
         if any(self._limited[name] for name in sounds):
             return tuple(self._limited_evidence(name, sounds[name]) for name in sorted(sounds))
         return super().evidence(sounds)

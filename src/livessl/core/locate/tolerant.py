@@ -1,11 +1,11 @@
-"""Evidence that bears microphones of one array that clocks of their own sample. It sees correlations and no sound.
+"""Widens the evidence of arrays whose channels have different clocks. It uses correlations, and no samples.
 
-Where an array's channels come from several recorders, their clocks may be apart, by a standard deviation of
-`Uncertainty.clock_s` between two channels. The peaks of its pairs then lie at delays that belong to no common place,
-and the sum of sharp peaks may be highest where some of them meet by chance. Averaged over the delays that the clocks
-allow, the GCC of a pair is its convolution with their distribution, and peaks that the clocks have moved meet again.
+If the channels of an array come from several recorders, their clocks may differ, by a standard deviation of
+`Uncertainty.clock_s` between two channels. The delays of the pairs then have no common place, and the sum of sharp
+peaks may be highest at a place where some of them meet by chance. A GCC that is averaged over the possible delays is
+its convolution with the distribution of these delays, and its wider peaks meet again at the right place.
 
-What this costs is resolution, so the sharp evidence determines the place wherever both agree.
+Wide peaks have less resolution, so the sharp evidence determines the place if both agree.
 """
 
 from __future__ import annotations
@@ -19,20 +19,21 @@ from livessl.core.correlate.band import uses_envelope
 from livessl.core.types import Evidence, Float32Array, FloatArray
 
 SHARE: Final = 0.5
-"""Width of the distribution in units of the clocks' standard deviation. Half of it passes what is above 3 kHz in part,
-and peaks that are apart by one standard deviation still overlap; the whole would leave little of a band of 6 kHz."""
+"""Width of the distribution in units of the clocks' standard deviation. With a half, frequencies above 3 kHz are
+reduced but not lost, and peaks that differ by one standard deviation still overlap. With one, little of a band of 6 kHz
+would remain."""
 
 _WIDTHS: Final = 3.0
 """Half length of the distribution that is used, in units of its width."""
 
 
 def tolerant(evidence: Evidence) -> Evidence:
-    """Average an array's GCCs over the delays between its channels that their clocks allow.
+    """Average an array's GCCs over the possible delays between the clocks of its channels.
 
     Returns
     -------
     Evidence
-        The same object if its channels have one clock, or if its GCCs are magnitudes, whose peaks are wide as they are.
+        The same object if all channels have one clock, or if the GCCs are magnitudes, whose peaks are wide anyway.
     """
     spec, gcc = evidence.spec, evidence.gcc
     width_s, step_s = SHARE * spec.uncertainty.clock_s, float(gcc.lags_s[1] - gcc.lags_s[0])
@@ -53,7 +54,7 @@ def tolerant(evidence: Evidence) -> Evidence:
 
 
 def _averaged(values: Float32Array, weights: FloatArray) -> Float32Array:
-    """Average values (P, L) along the lags; beyond the ends they stay as they are there."""
+    """Average values (P, L) along the lags; beyond each end, the value at that end is used."""
     reach = len(weights) // 2
     padded = np.pad(values, ((0, 0), (reach, reach)), mode="edge")
     return np.array([np.convolve(row, weights, mode="valid") for row in padded], dtype=np.float32)
