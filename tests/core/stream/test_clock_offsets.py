@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from free_field import C_M_S, RATE_HZ, burst, delayed, tetra
-from livessl.core.stream.clock_offsets import HOP_S, LEAST_SOUNDS, ClockOffsets, lateness_s
+from livessl.core.stream.clock_offsets import INTERVAL_S, LEAST_SOUNDS, ClockOffsets, lateness_s
 from livessl.core.types import FRAME_NS, FRAME_S, ArraySpec, FloatArray, Frame
 
 NORTH = tetra("north", [2.7, 4.2, 1.3])
@@ -52,16 +52,16 @@ def test_difference_of_arrival_is_the_offset_of_the_clocks(ahead_s: float) -> No
     heard = {"north": frames_of(NORTH, knocks()), "south": frames_of(SOUTH, knocks(), ahead_s)}
     late = lateness_s(heard, travel_s([NORTH, SOUTH]))
     # a rise is known to the piece it falls into; three of them, interpolated, to half a piece
-    assert late["south"] - late["north"] == pytest.approx(ahead_s, abs=HOP_S / 2)
+    assert late["south"] - late["north"] == pytest.approx(ahead_s, abs=INTERVAL_S / 2)
 
 
 def test_travel_time_is_subtracted() -> None:
     heard = {"north": frames_of(NORTH, knocks()), "east": frames_of(EAST, knocks())}
     true_s = travel_s([NORTH, EAST])
-    assert true_s["east"] - true_s["north"] > 2 * HOP_S
-    assert lateness_s(heard, true_s)["east"] == pytest.approx(0.0, abs=HOP_S / 2)
+    assert true_s["east"] - true_s["north"] > 2 * INTERVAL_S
+    assert lateness_s(heard, true_s)["east"] == pytest.approx(0.0, abs=INTERVAL_S / 2)
     without = lateness_s(heard, {"north": 0.0, "east": 0.0})
-    assert without["east"] == pytest.approx(true_s["east"] - true_s["north"], abs=HOP_S / 2)
+    assert without["east"] == pytest.approx(true_s["east"] - true_s["north"], abs=INTERVAL_S / 2)
 
 
 def test_periodic_sound_gives_no_offset() -> None:

@@ -39,7 +39,7 @@ def is_too_old(frame_index: int, now_ns: int) -> bool:
 
 
 class Alignment:
-    """The streams of all arrays, and the frame index that closes next.
+    """Keeps the streams of all arrays, and closes frame indices in order.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ class Alignment:
         self.streams = {
             name: ArrayStream(spec, ArrayHealth(len(spec.microphones_m))) for name, spec in state.arrays.items()
         }
-        """Stream of each array. The mapping is replaced, never changed: any thread may walk through it."""
+        """Stream of each array. Any thread may iterate over the mapping, which is replaced and never changed."""
         self.now_ns = 0
         """Site time of the last step."""
         self.next: int | None = None
@@ -92,7 +92,7 @@ class Alignment:
         return replace(message, frame_index=message.frame_index - ahead) if ahead else message
 
     def accept(self, message: Message) -> bool:
-        """Take in a message on the joint frame index; return whether it is an active frame that came too late."""
+        """Take in a message on the joint frame index; return whether it is an active frame that is late."""
         stream, now_ns, is_late = self.streams[message.array], self.now_ns, False
         is_ahead = is_ahead_of_clock(message.frame_index, now_ns)
         if is_ahead or is_too_old(message.frame_index, now_ns):
@@ -113,7 +113,7 @@ class Alignment:
         return is_late
 
     def advance(self, frame_index: int) -> None:
-        """Record that every array has sent everything up to a frame index."""
+        """Record that every array has sent all messages up to a frame index."""
         for stream in self.streams.values():
             self._reach(stream, frame_index)
 
@@ -168,7 +168,7 @@ class Alignment:
             stream.fall_behind()
 
     def is_everyone_silent(self) -> bool:
-        """Return whether no array has sent anything for longer than the deadline and the hang-over together."""
+        """Return whether no array has sent a message for longer than the deadline and the hang-over together."""
         quiet_ns = self._deadline_s * 1e9 + self._state.parameters.activity.hang_over_s * 1e9
         last_ns = (stream.last_message_ns for stream in self.streams.values())
         return all(at_ns is None or self.now_ns - at_ns > quiet_ns for at_ns in last_ns)
@@ -205,7 +205,7 @@ class Alignment:
     # --- clocks
 
     def is_set_back(self, now_ns: int) -> bool:
-        """Return whether the server's clock was set back, so that frame indices that were closed lie in its future."""
+        """Return whether the server's clock was set back, so that closed frame indices lie in its future."""
         closed = self.closed
         return closed is not None and is_ahead_of_clock(closed, now_ns)
 
@@ -218,8 +218,8 @@ class Alignment:
     def correct_clocks(self) -> bool:
         """Align the arrays by the known offsets of their clocks from here on; return whether any frame index moved.
 
-        Call it only between sounds: in the middle of one it would split the sound. If an array's frame indices grow,
-        sound that was already reported is not reported again.
+        Call it only between sounds, because it would split a sound. If the frame indices of an array grow, sound that
+        was already reported is not reported again.
         """
         clocks, moved, onward = self._state.clock_offsets, False, 0
         if clocks is None:

@@ -1,6 +1,6 @@
-"""Array health: the state of an array, the reason for it, and the figures that people look at. It reads no clock.
+"""Decides the health of an array: healthy, quiet, degraded, lost and so on, with the reason. It reads no clock.
 
-`ArrayHealth.state` is the only place where the state is decided.
+`ArrayHealth.state` is the only function that decides the state. The module also keeps the figures of each array.
 """
 
 from __future__ import annotations
@@ -19,32 +19,33 @@ from livessl.core.stream.outlier_votes import Votes, is_suspect
 from livessl.core.types import FRAME_S, ClockState, Float32Array, Frame, Mark
 
 LOST_NS: Final = 1_500_000_000
-"""Time, in nanoseconds, without a message after which an array is lost. Messages come every 50 ms, and clients are to
-know of a loss within 2 s."""
+"""Time, in nanoseconds, without a message after which an array is lost. Messages arrive every 50 ms, and clients
+must be notified of a loss within 2 s."""
 
 TROUBLE_NS: Final = 10_000_000_000
-"""Time, in nanoseconds, for which a fault keeps an array degraded after it was last seen."""
+"""Time, in nanoseconds, for which an array stays degraded after a fault was last observed."""
 
 DEAD_CHANNEL_NS: Final = 1_000_000_000
-"""Time, in nanoseconds, after which a channel of all-zero samples is a dead microphone; every live one has noise."""
+"""Time, in nanoseconds, after which a channel of all-zero samples counts as a dead microphone. Working microphones
+always have noise."""
 
 WEAK_FRAMES: Final = 10
-"""Channels are checked for missing sound in one active frame out of this many; a fault is reported after a second."""
+"""Interval, in active frames, at which channels are checked for missing sound; a fault is reported after a second."""
 
 HUM: Final = 10.0
-"""Ratio of a quiet frame's power to the background from which on hum or rumble is reported. Without it quiet frames
-stay below four times the background."""
+"""Ratio of a quiet frame's power to the background from which hum or rumble is reported. Without hum or rumble, quiet
+frames stay below four times the background."""
 
 HUM_MARKS: Final = 20
-"""Number of quiet frames in a row, one second, after which it is reported."""
+"""Number of consecutive quiet frames, one second, after which hum or rumble is reported."""
 
 _ZERO_STRIDE: Final = 64
-"""One sample in this many shows that a live channel is not all zeros; channels that look silent are then examined
-completely."""
+"""Interval, in samples, at which a channel is checked for zeros. All samples of a channel that seems silent are then
+checked."""
 
 
 class ArrayState(StrEnum):
-    """The state of an array, as the server sees it."""
+    """State of an array."""
 
     STARTING = "starting"
     HEALTHY = "healthy"
@@ -56,14 +57,14 @@ class ArrayState(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class NodeReport:
-    """Further knowledge of an array: from its node's messages without sound, from past sounds, and from the operator.
+    """Further facts about an array: from its node's messages without sound, from past sounds, and from the operator.
 
     Parameters
     ----------
     problem : str or None
         Fault of its device that the node reports.
     is_live : bool
-        Whether the node has sent anything lately, with or without sound.
+        Whether the node has recently sent any message, with or without sound.
     is_disabled : bool
         Whether an operator has disabled the array.
     finding : str or None
@@ -130,7 +131,7 @@ class ArrayHealth:
         self.note(now_ns, fault)
 
     def note_late(self, now_ns: int, frames: int = 0) -> None:
-        """Note that the array is late; `frames` is the number of late frames that have come, 0 if none has yet."""
+        """Note that the array is late; `frames` is the number of late frames that have arrived, which may be 0."""
         self.counters["late"] += frames
         self.note(now_ns, "its frames come after their deadline")
 
@@ -150,7 +151,7 @@ class ArrayHealth:
             self.hum_hz = strongest_hz(frame.samples, frame.sample_rate_hz, band_hz)
 
     def take_mark(self, mark: Mark, now_ns: int, *, is_newest: bool) -> None:
-        """Take in a mark; `is_newest` unless a message of a later frame index came before it."""
+        """Take in a mark; `is_newest` is False if a message of a later frame index arrived before it."""
         self.counters["marks"] += 1
         if self.mark is not None:
             if mark.overflows > self.mark.overflows:
@@ -182,15 +183,15 @@ class ArrayHealth:
         ----------
         now_ns : int
         age_ns : int or None
-            Time since its last message; None before the first.
+            Time since the last message of the array, nanoseconds; None before the first message.
         has_left : bool
-            Whether its node has ended on purpose.
+            Whether the node of the array has ended on purpose.
         votes : Votes
         clock_offset : ClockOffset or None
-            Offset of its node's clock, if it is known.
+            Offset of the node's clock; None if it is not known.
         node : NodeReport
         channel_fault : str or None
-            Fault of its channels with which its sound is not used, in words.
+            Fault of its channels, in words, because of which its sound is not used; None without a fault.
         """
         state, reason = self._state_by_messages(now_ns, age_ns, votes, has_left=has_left)
         if channel_fault is not None and state in (ArrayState.HEALTHY, ArrayState.DEGRADED):
@@ -224,7 +225,7 @@ class ArrayHealth:
         return (ArrayState.HEALTHY, self._hum()) if reason is None else (ArrayState.DEGRADED, reason)
 
     def _hum(self) -> str | None:
-        """Return a note on hum or rumble, with which an array works; None without it."""
+        """Return a note on hum or rumble, which does not stop an array from working; None without hum or rumble."""
         if self.hum_marks < HUM_MARKS:
             return None
         where = "" if self.hum_hz is None else f", strongest near {self.hum_hz:.0f} Hz"

@@ -1,4 +1,4 @@
-"""One array's messages on the joint frame index: its frames, what was computed from them, and how far it has come."""
+"""Keeps one array's frames on the joint frame index, their correlations, and the progress of the array."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from livessl.core.types import ArraySpec, Frame
 
 @dataclass(slots=True)
 class ArrayStream:
-    """The frames of one array that an answer may still need, and where it stands."""
+    """The frames of one array that a result may still need, and the frame index that the array has reached."""
 
     spec: ArraySpec
     health: ArrayHealth
@@ -31,16 +31,16 @@ class ArrayStream:
     upcoming: Correlations = field(default_factory=Correlations)  # for the sound that may follow this one
 
     def renewed(self) -> ArrayStream:
-        """Return an empty stream of the same array; its counters and what is known of its clock stay."""
+        """Return an empty stream of the same array with the same counters and the same correction of its clock."""
         health = ArrayHealth(self.health.microphones, self.health.counters)
         return ArrayStream(self.spec, health, self.frames_ahead, self.rest_ns)
 
     def is_newest(self, frame_index: int) -> bool:
-        """Return whether no message of a later frame index has come."""
+        """Return whether no message of a later frame index has arrived."""
         return self.complete_until is None or frame_index >= self.complete_until
 
     def advance(self, frame_index: int, now_ns: int) -> None:
-        """Record that everything up to a frame index has come."""
+        """Record that all messages up to a frame index have arrived."""
         self.last_message_ns, self.has_left = now_ns, False
         self.complete_until = frame_index if self.complete_until is None else max(self.complete_until, frame_index)
 
@@ -65,7 +65,7 @@ class ArrayStream:
         self.frames[frame.frame_index] = frame
 
     def has_active(self, frame_index: int) -> bool:
-        """Return whether the frame of a frame index is there and active."""
+        """Return whether there is an active frame at a frame index."""
         frame = self.frames.get(frame_index)
         return frame is not None and frame.active
 
@@ -84,7 +84,7 @@ class ArrayStream:
         return segments, there
 
     def release_samples(self, before: int) -> None:
-        """Release the samples of the frames before a frame index; the rest of these frames stays."""
+        """Release the samples of the frames before a frame index; the frames are kept without samples."""
         for frame_index, frame in self.frames.items():
             if frame_index < before and frame.samples.size:
                 self.frames[frame_index] = frame.without_samples()

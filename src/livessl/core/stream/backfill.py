@@ -26,20 +26,22 @@ SURE_WITHOUT_BACKFILL: Final = 0.95
 """Confidence at and above which no frames are requested."""
 
 MOST_REQUESTED_ARRAYS: Final = 4
-"""Most arrays from which frames are requested for one event; the nearest to those that detected it come first."""
+"""Largest number of arrays from which frames are requested for one event. The arrays nearest to those that detected the
+event come first."""
 
 MOST_REQUESTED_S: Final = 3.0
-"""Longest stretch, in seconds, requested for one event, pre-roll included; arrays that detected the event already cover
-the rest of a longer one."""
+"""Longest span, in seconds, that is requested for one event, pre-roll included. The arrays that detected a longer event
+cover its rest."""
 
 SHARE: Final = 0.25
-"""Largest share of an array's sound that is requested in the long run; at the start `RECENT_S` of sound may be."""
+"""Largest share of an array's sound that is requested in the long run. At the start, `RECENT_S` of sound may be
+requested."""
 
 _RANK: Final = {Status.REFUSED: 0, Status.DIRECTION_ONLY: 1, Status.LOCATED: 2}
 
 
 class Backfill:
-    """Chooses what to request for an event, and reconsiders its results with the frames that have come.
+    """Chooses the frames to request for an event, and locates the event again with the frames that have arrived.
 
     Parameters
     ----------
@@ -58,7 +60,7 @@ class Backfill:
         Parameters
         ----------
         event : PendingEvent
-            With the results of the arrays that detected it.
+            Event with the results of the arrays that detected it.
         span : range
             Frame indices of the event up to its last active frame, pre-roll included.
         present : collection of str
@@ -85,7 +87,7 @@ class Backfill:
             requested.take(frame)
 
     def is_over(self, event: PendingEvent, now_ns: int) -> bool:
-        """Return whether every frame that can still come has come, or the wait has timed out."""
+        """Return whether all requested frames that can still arrive have arrived, or the wait has timed out."""
         if now_ns - event.requested_ns >= self._state.parameters.backfill_wait_s * 1e9:
             return True
         requested = event.requested.items()
@@ -107,7 +109,7 @@ class Backfill:
         return best
 
     def start_over(self) -> None:
-        """Forget what was requested before."""
+        """Forget all earlier requests."""
         self._allowances.clear()
 
 

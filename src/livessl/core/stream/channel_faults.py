@@ -1,16 +1,18 @@
-"""Faults of channels that show in the sound: channels that are copies of others, and inverted ones.
+"""Finds channels that are copies of others, and inverted channels, in the sound.
 
-An array with such a fault gives wrong directions with great confidence, so its sound is not used. This module sees
+An array with such a fault gives wrong directions with high confidence, so its sound is not used. This module uses
 samples and correlations, and locates nothing. `array_health` finds dead and weak channels, and
 `livessl.core.commission` finds swapped ones.
 
-- *Copies.* Two microphones have noise of their own; in quiet frames they are never the same signal, whatever the sound
-  field. Two channels are copies if they are the same up to a factor: first in their differences from sample to sample,
-  in which hum and rumble are small, then in every part of the spectrum, so that a single tone does not count.
+- *Copies.* Every microphone has its own noise, so two microphones never have the same signal in quiet frames, whatever
+  the sound field. Two channels are copies if their signals are the same up to a factor. This is checked first in the
+  differences from sample to sample, in which hum and rumble are small, and then in every part of the spectrum, so that
+  a single tone is not enough.
 - *Two arrays on the same channels.* The first samples of each channel are looked up among those of all other arrays at
-  that frame index, so that the cost of a frame does not grow with the number of arrays.
-- *Inverted channels.* The GCC of a pair has its extreme where the direct sound is; it is negative if one of the two
-  channels is inverted. If the signs of the pairs are clear and fit, they show which channels differ from the others.
+  the same frame index, so that the cost of a frame does not grow with the number of arrays.
+- *Inverted channels.* The GCC of a pair has its extreme at the delay of the direct sound. The extreme is negative if
+one
+  of the two channels is inverted. If the signs of the pairs are clear and consistent, they show which channels differ.
 """
 
 from __future__ import annotations
@@ -27,57 +29,57 @@ from livessl.core.geometry import microphone_pairs
 from livessl.core.types import BoolArray, Float32Array, FloatArray, Frame
 
 QUIET_FRAMES: Final = 3
-"""Number of quiet frames in a row in which channels are the same from which on they are copies. Quiet frames come
+"""Number of consecutive quiet frames in which channels must be the same to count as copies. There are quiet frames
 before and after every sound."""
 
 SHARED_FRAMES: Final = 2
-"""Number of frames with sound in which channels must be the same as well."""
+"""Number of frames with sound in which channels must also be the same."""
 
 COMPARED_FRAMES: Final = 4
 """Number of frames, from the beginning of a sound, in which an array's channels are compared."""
 
 COPIED_SOUNDS: Final = 3
-"""Number of sounds in a row in which channels must be the same where the background is digital silence and shows
-nothing. Two microphones may receive exactly the same of one sound, if it comes from the plane midway between them."""
+"""Number of consecutive sounds in which channels must be the same if the background is digital silence. Two microphones
+can receive exactly the same signal from one sound if it comes from the plane midway between them."""
 
 SAME: Final = 0.99
 """Least correlation, and least mean cosine of the phase differences, of channels that are the same. Copies give 1.
 Distinct microphones give less than 0.9, because each adds its own noise."""
 
 CLEAR: Final = 2.0
-"""Least ratio of the extremes of a pair's GCC, of either sign, from which its sign is clear. A sound of many
-frequencies gives 3 to 5, a tone 1."""
+"""Least ratio between the positive and negative extremes of a pair's GCC at which its sign is clear. A sound of many
+frequencies has a ratio of 3 to 5, a tone of 1."""
 
 COHERENT: Final = 0.3
-"""Least height of such an extreme, relative to that of a single direct sound; noise stays below 0.15."""
+"""Least height of the larger extreme, relative to that of a single direct sound; noise stays below 0.15."""
 
 INVERTED_SOUNDS: Final = 2
-"""Number of sounds, of the last `SIGNED_SOUNDS`, with the same signs after which channels are reported as inverted. A
-single such sound is located without an array of `LEAST_SIGNS` channels."""
+"""Number of sounds with the same signs, among the last `SIGNED_SOUNDS`, after which channels are reported as inverted.
+A single such sound is located without the array if the array has at least `LEAST_SIGNS` channels."""
 
 LEAST_SIGNS: Final = 3
-"""Least number of channels of an array that a single sound is located without: a single pair has nothing to check its
-sign by, and reflections of one real clap of 240 gave the wrong one."""
+"""Least number of channels of an array that is excluded because of a single sound. The sign of a single pair cannot be
+checked by others, and it was wrong for 1 of 240 real claps because of reflections."""
 
 SIGNED_SOUNDS: Final = 5
-"""Number of last sounds of which the signs are kept."""
+"""Number of latest sounds whose signs are kept."""
 
 _PRINT_SAMPLES: Final = 48
-"""Number of samples that identify a channel's frame. They take more values than there will ever be frames, as long as
-one bit of them is noise."""
+"""Number of samples that identify a channel's frame. If one bit of each sample is noise, they have more possible values
+than there will ever be frames."""
 
 _COMPARED_SAMPLES: Final = 512
-"""Number of samples that are compared first: where they differ, the whole frame need not be examined."""
+"""Number of samples that are compared first; if they differ, the rest of the frame is not examined."""
 
 _PRINTED_FRAMES: Final = 64
-"""Number of frame indices of which the samples are remembered: 3 s, longer than any array may be late."""
+"""Number of frame indices whose samples are remembered: 3 s, longer than any array may be late."""
 
 Pair = tuple[int, int]
 
 
 @dataclass(slots=True)
 class _Likeness:
-    """Counts of the time for which two channels, or the channels of two arrays, have been the same."""
+    """Counts the frames and sounds in which two channels, or the channels of two arrays, were the same."""
 
     quiet_frames: int = 0
     active_frames: int = 0
@@ -90,7 +92,7 @@ class _Likeness:
 
     @property
     def is_copy(self) -> bool:
-        """True if sound as well as background was the same; simulated microphones may differ in the sound alone."""
+        """True if both sound and background were the same; simulated microphones may differ only in the sound."""
         background = self.quiet_frames >= QUIET_FRAMES or self.sounds >= COPIED_SOUNDS
         return background and self.active_frames >= SHARED_FRAMES
 
@@ -106,7 +108,7 @@ class _Channels:
 
 
 class ChannelFaults:
-    """The faults of all arrays' channels. The words are replaced, never changed: any thread may read them.
+    """The faults of the channels of all arrays. Any thread may read the words, which are replaced and never changed.
 
     Parameters
     ----------
@@ -126,7 +128,7 @@ class ChannelFaults:
         return self._words.get(array)
 
     def among(self, arrays: Iterable[str]) -> dict[str, str]:
-        """Return the faults, in words, of those of these arrays that have one."""
+        """Return the faults, in words, of the given arrays that have one."""
         return {name: self._words[name] for name in arrays if name in self._words}
 
     def clear(self) -> None:
@@ -161,7 +163,7 @@ class ChannelFaults:
             known.alike.setdefault((first, second), _Likeness()).note(active=frame.active, begins=begins)
 
     def _look_up(self, frame: Frame, *, begins: bool) -> None:
-        """Compare the channels of an array with those of all others at the same frame index."""
+        """Compare the channels of an array with those of all other arrays at the same frame index."""
         where = self._where.setdefault(frame.frame_index, {})
         printed = self._prints.setdefault(frame.frame_index, {})
         shared: dict[str, list[Pair]] = {}
@@ -191,13 +193,13 @@ class ChannelFaults:
     # --- correlations
 
     def examine(self, array: str, start: int, onsets: Sequence[OnsetGCC]) -> str | None:
-        """Examine an array's part of a sound; return the fault, in words, with which it must not be located.
+        """Examine the sound of an array; return the fault, in words, because of which it must not be used.
 
         Parameters
         ----------
         array : str
         start : int
-            Frame index at which the sound began; if it is examined again, the signs are counted once.
+            Frame index at which the sound began. A sound that is examined again is counted once.
         onsets : sequence of OnsetGCC
             Correlations of its frames.
         """
@@ -237,9 +239,9 @@ class ChannelFaults:
 
 
 def polarity(onsets: OnsetGCC) -> tuple[int, ...] | None:
-    """Return the sign of each channel relative to most others, 1 or -1; None where it is not clear.
+    """Return the sign of each channel relative to most others, 1 or -1; None if the signs are not clear.
 
-    A channel's sign follows from its pairs with one channel whose pairs are all clear. All other clear pairs must fit.
+    The signs follow from the pairs of one channel whose pairs are all clear. All other clear pairs must be consistent.
     """
     if np.iscomplexobj(onsets.lags):
         return None  # magnitudes have no sign
@@ -279,7 +281,7 @@ def _same(samples: Float32Array) -> tuple[BoolArray, BoolArray]:
 
 
 def _mean_cosine(samples: Float32Array) -> float:
-    """Mean over all frequencies of the cosine of the phase difference of two channels (2, n), without its sign."""
+    """Return the absolute mean, over all frequencies, of the cosine of the phase difference of channels (2, n)."""
     spectra = scipy.fft.rfft(samples.astype(np.float64), axis=1)[:, 1:]
     cross = np.conj(spectra[0]) * spectra[1]
     size: FloatArray = np.abs(cross)
@@ -288,7 +290,7 @@ def _mean_cosine(samples: Float32Array) -> float:
 
 
 def _print(channel: Float32Array) -> bytes:
-    """Return what identifies a channel's frame (n,); empty if it does not change."""
+    """Return bytes that identify a channel's frame (n,); empty if all samples are equal."""
     first = channel[:_PRINT_SAMPLES]
     return first.tobytes() if first.size and np.any(first != first[0]) else b""
 

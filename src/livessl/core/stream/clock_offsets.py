@@ -1,9 +1,10 @@
-"""Offsets of the nodes' clocks, estimated from located events. It reads no clock.
+"""Estimates the offsets of the nodes' clocks from located events. It reads no clock.
 
 A sound at a known position arrives at each array after its travel time; any other difference of its arrival times is a
 difference of the clocks. Arrival times are compared by the rises of the power, correlated between arrays, so that
-reverberation, level and the kind of sound matter little. Each event gives one difference. A robust line through those
-of the last events gives each clock's offset and drift, relative to one of the clocks: which one is right is unknown.
+reverberation, level and the kind of sound matter little. Each event gives one difference. A robust line fit
+to the differences of the last events gives the offset and drift of each clock relative to one of the clocks, because it
+is unknown which clock is right.
 """
 
 from __future__ import annotations
@@ -19,56 +20,56 @@ import scipy
 from livessl.core.types import FRAME_S, ArraySpec, FloatArray, Frame
 
 MOST_OFF_S: Final = 0.6
-"""Greatest offset, in seconds, that is searched; with a greater one a sound is not one event of both arrays."""
+"""Greatest offset, in seconds, that is searched for. With a greater offset, a sound is not one event of both arrays."""
 
-HOP_S: Final = 0.005
-"""Length, in seconds, of the pieces whose power is computed; the peak is interpolated to a tenth of it."""
+INTERVAL_S: Final = 0.005
+"""Length, in seconds, of the intervals whose power is computed; the peak is interpolated to a tenth of this."""
 
 MOST_USED_S: Final = 3.0
 """Longest part of a sound, in seconds from its pre-roll on, that is used; the rest of a longer sound adds little."""
 
 LEAST_SOUNDS: Final = 3
-"""Least number of sounds from which an offset is believed."""
+"""Least number of sounds from which an offset is used."""
 
 KNOWN_S: Final = 0.01
-"""Greatest standard deviation, in seconds, of an offset that is believed."""
+"""Greatest standard deviation, in seconds, of an offset that is used."""
 
 MOST_SOUNDS: Final = 32
-"""Number of last sounds that an offset is estimated from."""
+"""Number of latest sounds from which an offset is estimated."""
 
 SMALL_S: Final = 0.01
-"""Offset, in seconds, below which nothing is corrected; frames are 50 ms long."""
+"""Offset, in seconds, below which a clock is not corrected; frames are 50 ms long."""
 
 _HYSTERESIS: Final = 0.7
-"""Part of a frame that the rest of an offset may reach before the correction by whole frames changes; above a half, so
-that a correction does not come and go."""
+"""Rest of an offset, as a share of a frame, from which the correction by whole frames changes. It is above 0.5, so that
+a correction does not alternate."""
 
 _DECAY_DB_S: Final = 40.0
-"""Decay of reverberation, in dB a second; power that stays below such a decay from earlier power is no rise."""
+"""Decay of reverberation, in dB per second. Power below such a decay of earlier power is no rise."""
 
 _STANDS_OUT: Final = 0.3
 """Least normalized height of the correlation's peak."""
 
 _RIVAL: Final = 0.8
-"""Greatest height of another peak, as a share of the first; the lag of a sound that repeats itself is ambiguous."""
+"""Greatest height of another peak, as a share of the first. The lag of a sound that repeats itself is ambiguous."""
 
 _MICROPHONES: Final = 2
-"""Number of microphones of each array that are used; one may be dead."""
+"""Number of microphones of each array that are used: two, because one may be dead."""
 
 _LEAST_POWER: Final = 2.0**-30 / 12.0
-"""Least power, full scale squared: that of rounding to 16 bits."""
+"""Least power, full scale squared: the power of rounding to 16 bits."""
 
 _ABOVE_NOISE: Final = 4.0
-"""Ratio to the power of the pre-roll above which power is not noise."""
+"""Ratio of power to that of the pre-roll above which the power belongs to a sound."""
 
 _APART_S: Final = 0.03
-"""Distance from the peak, in seconds, beyond which another maximum is a peak of its own."""
+"""Distance from the peak, in seconds, beyond which another maximum counts as a separate peak."""
 
 _DRIFT: Final = 50e-6
 """Standard deviation of the rates of crystals, in seconds per second: the prior of the drift."""
 
 _LEAST_SCATTER_S: Final = 1e-3
-"""Least standard deviation, in seconds, of one sound's difference; positions are not known better than this."""
+"""Least standard deviation, in seconds, of one sound's difference; positions are not more exact."""
 
 _TUKEY: Final = 4.7
 """Number of standard deviations beyond which a sound has no weight: the usual constant of Tukey's biweight."""
@@ -77,8 +78,8 @@ _ITERATIONS: Final = 6
 """Number of iterations of the weights; further ones change the line by less than the scatter of one sound."""
 
 _STEP_S: Final = 0.05
-"""Deviation, in seconds, of the last `LEAST_SOUNDS` sounds from the line before them which shows that the clock was
-set, if these sounds agree with one another."""
+"""Least deviation, in seconds, of the last `LEAST_SOUNDS` sounds from the earlier line at which the clock counts as
+having been set, if these sounds agree with one another."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,12 +89,12 @@ class ClockOffset:
     Parameters
     ----------
     offset_s, std_s : float
-        The offset and its standard deviation. A positive offset is ahead: the clock shows later times than the
-        reference.
+        The offset and its standard deviation. With a positive offset the clock is ahead: it shows later times than
+        the reference.
     sounds : int
-        Number of sounds that it was estimated from.
+        Number of sounds from which the offset was estimated.
     reference : str
-        Name of the clock that it is relative to.
+        Name of the reference clock.
     """
 
     offset_s: float
@@ -103,12 +104,13 @@ class ClockOffset:
 
 
 class ClockOffsets:
-    """Running estimate of the offsets of all clocks.
+    """A running estimate of the offsets of all clocks.
 
     Parameters
     ----------
     clocks : mapping of array to clock
-        Arrays of one node have one clock. The first one is the reference while there are two.
+        The clock of each array; arrays of one node have the same clock. With two clocks, the first one is the
+        reference.
     c_m_s : float
         Speed of sound.
     """
@@ -124,15 +126,15 @@ class ClockOffsets:
         self._frames: dict[str, int] = dict.fromkeys(self._late, 0)
 
     def of(self, array: str) -> ClockOffset | None:
-        """Return the offset of an array's clock at the last sound; None where it is not known yet."""
+        """Return the offset of an array's clock at the last sound; None if it is not known yet."""
         return self._known.get(self._clock_of[array])
 
     def frames_ahead(self, array: str) -> int:
-        """Return the correction of an array's frame indices, in whole frames; it has a hysteresis."""
+        """Return the correction of an array's frame indices, in whole frames and with hysteresis."""
         return self._frames[self._clock_of[array]]
 
     def rest_s(self, array: str) -> float:
-        """Return the rest of an array's offset in seconds; 0 where the offset is too small to correct."""
+        """Return the rest of an array's offset, in seconds; 0 if the offset is too small to be corrected."""
         offset, frames = self.of(array), self.frames_ahead(array)
         if offset is None or (frames == 0 and abs(offset.offset_s) < SMALL_S):
             return 0.0
@@ -168,7 +170,7 @@ class ClockOffsets:
         time_ns : int
             Site time of the sound.
         late_s : mapping of array to float
-            Its arrival by each array's own clock less the travel time, in seconds from any common moment.
+            Arrival time by each array's own clock minus the travel time, in seconds after any common time.
         """
         each: dict[str, list[float]] = {}
         for array, late in late_s.items():
@@ -183,7 +185,7 @@ class ClockOffsets:
         self._know(time_ns)
 
     def state(self) -> dict[str, Any]:
-        """Return all that is known, as values that JSON can hold."""
+        """Return the state of all clocks, as values of types that JSON has."""
         return {
             "heard": {clock: list(map(list, late)) for clock, late in self._late.items()},
             "frames": dict(self._frames),
@@ -191,7 +193,7 @@ class ClockOffsets:
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Continue from an earlier `state`; clocks that do not exist any more are left out."""
+        """Continue from an earlier `state`; clocks that no longer exist are ignored."""
         for clock, late in self._late.items():
             late.extend((int(time_ns), float(late_s)) for time_ns, late_s in state["heard"].get(clock, ()))
             self._frames[clock] = int(state["frames"].get(clock, 0))
@@ -204,7 +206,7 @@ class ClockOffsets:
         return self._lines[clock]
 
     def _forget_before_step(self, clock: str, time_ns: int, late_s: float) -> None:
-        """Forget all but the last sounds where these and the new one show that the clock was set: see `_STEP_S`."""
+        """Forget all but the last sounds if these and the new one show that the clock was set: see `_STEP_S`."""
         kept = self._late[clock]
         if len(kept) < 2 * LEAST_SOUNDS:
             return
@@ -239,7 +241,7 @@ class ClockOffsets:
 
 
 def clock_is_off(offset: ClockOffset) -> str:
-    """Return the reason why an array with this offset, of more than a frame, is degraded."""
+    """Return the reason why an array with this offset, which exceeds a frame, is degraded."""
     side = "ahead of" if offset.offset_s > 0 else "behind"
     return (
         f"its clock is {1e3 * abs(offset.offset_s):.0f} ms (±{1e3 * offset.std_s:.0f}) {side} that of "
@@ -255,14 +257,14 @@ class _Line:
     covariance: FloatArray  # (2, 2) of offset and drift
 
     def at(self, time_ns: int) -> tuple[float, float]:
-        """Offset at a time and its standard deviation, seconds."""
+        """Return the offset at a time and its standard deviation, seconds."""
         since_s = (time_ns - self.origin_ns) / 1e9
         terms = np.array([1.0, since_s])
         return self.offset_s + self.drift * since_s, float(np.sqrt(terms @ self.covariance @ terms))
 
 
 def _line(times_ns: Sequence[int], offsets_s: Sequence[float]) -> _Line:
-    """Fit a line to offsets by iterated weights (Tukey's biweight); the prior keeps it flat where there are few."""
+    """Fit a line to offsets by iterated weights (Tukey's biweight); with few offsets the prior keeps it flat."""
     origin_ns, late_s = times_ns[-1], np.array(offsets_s)
     terms = np.stack([np.ones_like(late_s), (np.array(times_ns) - origin_ns) / 1e9], axis=1)
     found = np.array([np.median(late_s), 0.0])
@@ -305,11 +307,11 @@ def lateness_s(frames: Mapping[str, Sequence[Frame]], travel_s: Mapping[str, flo
 
 
 def _rises(frames: Sequence[Frame]) -> FloatArray:
-    """Return by how much the log power of each piece of `HOP_S` exceeds the decay of all before it, (n,)."""
+    """Return how far the log power of each interval exceeds the decay of all earlier ones, (n,)."""
     frames = frames[: round(MOST_USED_S / FRAME_S)]
     samples = np.concatenate([frame.samples[:_MICROPHONES] for frame in frames], axis=1)
     steps = np.diff(samples, axis=1, prepend=samples[:, :1])  # no rumble
-    pieces = round(FRAME_S / HOP_S)
+    pieces = round(FRAME_S / INTERVAL_S)
     lengths = [frame.samples.shape[1] for frame in frames]
     begins = np.cumsum([0, *lengths[:-1]])
     edges = np.concatenate([first + np.arange(pieces) * n // pieces for first, n in zip(begins, lengths, strict=True)])
@@ -317,13 +319,13 @@ def _rises(frames: Sequence[Frame]) -> FloatArray:
     power = energy / (len(samples) * np.maximum(1, np.diff(edges, append=samples.shape[1])))
     floor = max(float(np.median(power[: 2 * pieces])), _LEAST_POWER)
     level = np.log(np.maximum(power, _ABOVE_NOISE * floor))
-    decay = np.log(10.0) / 10.0 * _DECAY_DB_S * HOP_S * np.arange(len(level))
+    decay = np.log(10.0) / 10.0 * _DECAY_DB_S * INTERVAL_S * np.arange(len(level))
     past = np.maximum.accumulate(level + decay) - decay
     return np.asarray(np.maximum(0.0, level[1:] - past[:-1]))
 
 
 def _lag_s(first: FloatArray, other: FloatArray) -> float | None:
-    """Return by how much later the other's rises come, in seconds; None where they do not match, or match twice."""
+    """Return by how much the rises of the other are later, in seconds; None if they do not match, or match twice."""
     norm = float(np.sqrt(np.square(first).sum() * np.square(other).sum()))
     if norm == 0.0:
         return None
@@ -331,12 +333,12 @@ def _lag_s(first: FloatArray, other: FloatArray) -> float | None:
     smooth = np.array([0.25, 0.5, 0.25])
     spectra = [scipy.fft.rfft(np.convolve(rises, smooth), size) for rises in (first, other)]
     fits = scipy.fft.irfft(np.conj(spectra[0]) * spectra[1], size) / norm
-    reach = min(round(MOST_OFF_S / HOP_S), size // 2 - 1)
+    reach = min(round(MOST_OFF_S / INTERVAL_S), size // 2 - 1)
     lags = np.arange(-reach, reach + 1)
     fits = fits[lags]
     top = int(fits.argmax())
-    apart = np.abs(lags - lags[top]) > _APART_S / HOP_S
+    apart = np.abs(lags - lags[top]) > _APART_S / INTERVAL_S
     if not 0 < top < len(lags) - 1 or fits[top] < _STANDS_OUT or fits[apart].max() > _RIVAL * fits[top]:
         return None
     before, at, after = fits[top - 1 : top + 2]
-    return float(lags[top] + 0.5 * (before - after) / (before - 2.0 * at + after)) * HOP_S
+    return float(lags[top] + 0.5 * (before - after) / (before - 2.0 * at + after)) * INTERVAL_S

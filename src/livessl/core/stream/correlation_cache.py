@@ -1,8 +1,9 @@
 """Caches the correlation of every frame, so that the early and the final pass compute it once.
 
-A run is a stretch of an array's frames with consecutive frame indices. What a front end returns for a frame depends on
-the whole run up to it; a key made of the run's frames therefore identifies the correlation. A pass that follows a run
-which another pass has followed before finds its correlations in the cache, and continues where that one ended.
+A run is a sequence of an array's frames with consecutive frame indices. The result of a front end for a frame depends
+on the whole run up to that frame, so a key computed from the frames of the run identifies the correlation. If a pass
+processes a run that another pass has processed before, it finds the correlations in the cache, and continues after
+them.
 """
 
 from __future__ import annotations
@@ -17,10 +18,10 @@ from livessl.core.locate.estimator import Estimator
 from livessl.core.types import Frame
 
 CACHED_FRAMES: Final = 4096
-"""Number of frames whose correlations are cached: some seconds of 64 arrays."""
+"""Number of frames whose correlations are cached: a few seconds of 64 arrays."""
 
 CACHED_FRONT_ENDS: Final = 4
-"""Number of front ends cached for each array, at the ends of the runs that were followed last."""
+"""Number of front ends that are cached for each array, with the states at the ends of the latest runs."""
 
 ForEach = Callable[[Callable[[Any], None], Iterable[Any]], None]
 """A parallel `for_each(function, items)`: applies `function` to every item, in any order; returns when all are done."""
@@ -28,18 +29,18 @@ ForEach = Callable[[Callable[[Any], None], Iterable[Any]], None]
 
 @dataclass(slots=True)
 class Correlations:
-    """Correlations of one array's frames, by frame index, and the run that they have followed so far."""
+    """Correlations of one array's frames, by frame index, and the run to which they belong."""
 
     run: int | None = None  # key of the run; None where the last frame index had no frame
     first: int = 0  # frame index at which the run begins
     onsets: dict[int, OnsetGCC] = field(default_factory=dict)
 
     def has(self, frame_indices: Iterable[int]) -> bool:
-        """Return whether the correlations of all these frame indices are there."""
+        """Return whether there are correlations for all of these frame indices."""
         return all(frame_index in self.onsets for frame_index in frame_indices)
 
     def at(self, frame_indices: Iterable[int]) -> tuple[OnsetGCC, ...]:
-        """Return the correlations of those of these frame indices that have one."""
+        """Return the existing correlations for these frame indices."""
         return tuple(self.onsets[frame_index] for frame_index in frame_indices if frame_index in self.onsets)
 
 
@@ -103,7 +104,7 @@ class CorrelationCache:
     def _caught_up(
         self, array: str, sample_rate_hz: float, frame_indices: range, frames: Mapping[int, Frame]
     ) -> OnsetFrontEnd | None:
-        """Make a front end and push what is left of a run; None where the estimator uses no front end."""
+        """Make a front end and push the rest of a run; return None if the estimator uses no front end."""
         front_end = self._estimator.onset_front_end(array, sample_rate_hz)
         if front_end is not None:
             for frame_index in frame_indices:

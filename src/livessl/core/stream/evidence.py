@@ -1,7 +1,7 @@
-"""Collects the excerpts that an event or a window is located from.
+"""Collects the excerpts from which events and windows are located.
 
-It also decides which samples are kept while a sound goes on, and correlates frames before a sound begins, so that the
-sound does not have to wait for its pre-roll.
+It also decides which samples are kept while a sound continues. It correlates frames before a sound begins, so that
+locating the sound does not have to wait for the correlation of the pre-roll.
 """
 
 from __future__ import annotations
@@ -22,11 +22,12 @@ from livessl.core.stream.site_state import SiteState
 from livessl.core.types import FRAME_NS, FRAME_S, ArraySpec, Frame
 
 KEPT_ARRAYS: Final = 24
-"""Number of arrays whose samples are kept while a sound goes on: those with the greatest onset strength so far, half as
-many again as an estimator uses. Only correlations are kept for the others, because 64 arrays send 45 MB/s."""
+"""Number of arrays whose samples are kept while a sound continues: those with the greatest onset strength so far, one
+and a half times as many as an estimator uses. Only correlations are kept for the others, because 64 arrays send 45
+MB/s."""
 
 RELEASE_FRAMES: Final = 10
-"""Number of frames between two updates of that choice."""
+"""Number of frames between two choices of the `KEPT_ARRAYS`."""
 
 
 class EvidenceCollector:
@@ -38,7 +39,7 @@ class EvidenceCollector:
     alignment : Alignment
         The arrays' frames on the joint frame index.
     correlates_ahead : bool
-        Whether frames are correlated before a sound begins. With many arrays there is no time for it afterwards.
+        Whether frames are correlated before a sound begins. With many arrays there is no time for this afterwards.
     """
 
     def __init__(self, state: SiteState, alignment: Alignment, *, correlates_ahead: bool) -> None:
@@ -60,15 +61,15 @@ class EvidenceCollector:
 
     @property
     def located(self) -> frozenset[str] | None:
-        """Arrays that the event that goes on is located from; None for all."""
+        """Arrays from which the current event is located; None for all."""
         return self._located
 
     def end_event(self) -> None:
-        """Forget which arrays the event was located from."""
+        """Forget the arrays from which the event was located."""
         self._located = None
 
     def _choose(self, frame_indices: Iterable[int]) -> list[ArrayStream]:
-        """Choose the arrays that the event is located from; return those of them that were not chosen before.
+        """Choose the arrays from which the event is located; return those that were not chosen before.
 
         Parameters
         ----------
@@ -93,7 +94,7 @@ class EvidenceCollector:
         return self._located is None or stream.spec.name in self._located
 
     def _streams(self) -> list[ArrayStream]:
-        """Return the streams of the arrays that the event is located from."""
+        """Return the streams of the arrays from which the event is located."""
         return [stream for stream in self._alignment.streams.values() if self._is_located(stream)]
 
     # --- correlations
@@ -101,8 +102,8 @@ class EvidenceCollector:
     def begin_event(self, start: int) -> None:
         """Correlate the pre-roll of an event that became active at `start`.
 
-        The correlations begin anew, so that an event is the same whatever came before it. If a sound was split
-        because of its length, they continue.
+        The correlations begin anew, so that an event does not depend on earlier sound. They continue if a sound was
+        split because of its length.
         """
         self._onset_strength = {}
         self._postponed.clear()
@@ -126,9 +127,9 @@ class EvidenceCollector:
         self._ahead = None
 
     def correlate(self, frame_index: int, *, active: bool) -> None:
-        """Correlate the frames of an event at a frame index, of which `active` says whether any array is active.
+        """Correlate the frames of an event at a frame index; `active` is True if any array is active there.
 
-        While the server is overloaded, quiet frames are correlated only once sound follows them.
+        While the server is overloaded, quiet frames are correlated only if sound follows.
         """
         joined = self._choose([frame_index])
         if not (active or self._state.relief.ahead):
@@ -139,13 +140,13 @@ class EvidenceCollector:
         self._postponed.clear()
 
     def correlate_arrived(self, frame_index: int) -> None:
-        """Correlate the frames that have arrived of a frame index that still waits for other arrays."""
+        """Correlate the frames that have arrived at a frame index, while other arrays are still awaited."""
         here = [s for s in self._streams() if frame_index in s.frames and frame_index not in s.correlations.onsets]
         if here and not self._postponed and (self._state.relief.ahead or any(s.has_active(frame_index) for s in here)):
             self._correlate(here, [frame_index])
 
     def correlate_ahead(self, frame_index: int, begin: int | None) -> None:
-        """Correlate a quiet frame index, which may be in the pre-roll of the next sound.
+        """Correlate the frames at a quiet frame index, which may be in the pre-roll of the next sound.
 
         Parameters
         ----------
@@ -170,7 +171,7 @@ class EvidenceCollector:
         self._ahead = range(begin, frame_index + 1)
 
     def discard_ahead(self) -> None:
-        """Discard what was correlated ahead: an active frame came, or frame indices have moved."""
+        """Discard correlations made ahead, because an active frame arrived or frame indices have changed."""
         self._ahead = None
 
     def _correlate(self, streams: Iterable[ArrayStream], frame_indices: Sequence[int]) -> None:
@@ -206,7 +207,7 @@ class EvidenceCollector:
     def window(self, last: int) -> Excerpt:
         """Return the active frames of the window that ends with a frame index.
 
-        Those of suspect arrays, and of arrays with faulty channels, are left out.
+        Frames of suspect arrays, and of arrays with faulty channels, are not included.
         """
         window = range(last - self._parameters.window_frames + 1, last + 1)
         second_looks = self._state.relief.second_looks
@@ -261,7 +262,7 @@ class EvidenceCollector:
 
 
 def _correlated(stream: ArrayStream, span: range, begin: int) -> tuple[tuple[OnsetGCC, ...], Course]:
-    """Return the correlations of an array's frames in a span, and their course; its sound begins at `begin`."""
+    """Return the correlations of an array's frames in a span, and their `Course`; the sound begins at `begin`."""
     there = [k for k in span if k in stream.correlations.onsets and k in stream.frames]
     powers = np.array([stream.frames[k].power for k in there])
     return stream.correlations.at(there), Course(np.array(there, dtype=np.int64), powers, begin)

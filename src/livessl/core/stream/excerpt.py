@@ -1,4 +1,4 @@
-"""The sound that an event or a window is located from, as an estimator takes it. It decides nothing."""
+"""The sound from which an event or a window is located, in the form that estimators use. It decides nothing."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from livessl.core.types import Float32Array, FloatArray, Frame
 class Segments(Sequence[Float32Array]):
     """Segments of one array's samples, each (K, n), which are joined from frames when they are read.
 
-    Samples are thus never copied for all arrays at once, and not at all if they are not used. Frames whose samples were
-    released, which are the first ones, are left out.
+    Samples are therefore never copied for all arrays at once, and unused samples are not copied at all. Frames whose
+    samples were released, which are always the first ones, are missing.
     """
 
     def __init__(self, segments: Iterable[Sequence[Frame]]) -> None:
@@ -38,7 +38,7 @@ class Segments(Sequence[Float32Array]):
 
 
 class Sounds(Mapping[str, Sound]):
-    """The sound of each array, as an estimator takes it.
+    """The sound of each array, in the form that estimators use.
 
     Parameters
     ----------
@@ -73,16 +73,16 @@ class Sounds(Mapping[str, Sound]):
         *,
         requested: bool = False,
     ) -> None:
-        """Add the sound of an array: its segments of frames, at least one, and its frames' correlations and course.
+        """Add the sound of an array: at least one segment of frames, and the frames' correlations and `Course`.
 
-        `requested` if the array did not detect the sound, and its frames were requested.
+        `requested` is True if the array did not detect the sound, and its frames were requested.
         """
         self._segments[array], self._onsets[array], self._courses[array] = segments, onsets, course
         if requested:
             self._requested.add(array)
 
     def copy(self) -> Sounds:
-        """Return a copy that sounds can be added to."""
+        """Return a copy to which sounds can be added."""
         copy = Sounds(self.sources, self.suspects, ended=self.ended, second_looks=self.second_looks)
         copy._segments |= self._segments
         copy._onsets |= self._onsets
@@ -101,7 +101,7 @@ class Sounds(Mapping[str, Sound]):
 
     @property
     def has_onsets(self) -> bool:
-        """True if the estimator correlates every frame, and thus weights each array by what it received."""
+        """True if the estimator correlates every frame, and so weights each array by the sound that it received."""
         return any(self._onsets.values())
 
     def __getitem__(self, array: str) -> Sound:
@@ -127,9 +127,9 @@ class Sounds(Mapping[str, Sound]):
 
 @dataclass(frozen=True, slots=True)
 class BackfilledSound:
-    """The sound of an array that was requested: its frames from the event's start on.
+    """The requested frames of an array, from the start of the event on.
 
-    The correlations and their course include the pre-roll.
+    The correlations and their `Course` include the pre-roll.
     """
 
     frames: list[Frame]
@@ -139,16 +139,16 @@ class BackfilledSound:
 
 @dataclass(slots=True)
 class Excerpt:
-    """The part of all arrays' sound that an event or a window is located from.
+    """The sound of all arrays from which an event or a window is located.
 
     Parameters
     ----------
     sounds : Sounds
     start_ns, end_ns : int
-        Site time of its first frame's start and of its last frame's end.
+        Site times of the start of the first frame and of the end of the last one.
     powers : dict of array to (n,) float64
-        In-band mean power of each frame, full scale squared, of every array that detected it: also of those that it is
-        not located from, because it is clearer to enough others.
+        In-band mean power of each frame, full scale squared, of every array that detected the sound, also of arrays
+        that are not used because enough others are clearer.
     """
 
     sounds: Sounds
@@ -164,17 +164,17 @@ class Excerpt:
         course: Course,
         powers: FloatArray,
     ) -> None:
-        """Add the sound of an array: see `Sounds.add`; `powers` (n,) are those of its frames, full scale squared."""
+        """Add the sound of an array: see `Sounds.add`; `powers` (n,) of its frames are in full scale squared."""
         self.sounds.add(array, segments, onsets, course)
         self.powers[array] = powers
 
     def extend(self, start_ns: int, end_ns: int) -> None:
-        """Let the excerpt begin at `start_ns` at the latest, and end at `end_ns` at the earliest."""
+        """Extend the excerpt so that it includes the time from `start_ns` to `end_ns`."""
         self.start_ns, self.end_ns = min(self.start_ns, start_ns), max(self.end_ns, end_ns)
 
     @property
     def middle_ns(self) -> int:
-        """Site time of its middle."""
+        """Site time of the middle of the excerpt, nanoseconds."""
         return (self.start_ns + self.end_ns) // 2
 
     @property
@@ -183,12 +183,12 @@ class Excerpt:
         return max(float(power.max()) for power in self.powers.values())
 
     def without(self, arrays: Collection[str]) -> Excerpt:
-        """Return this excerpt without the sounds of some arrays; the times stay."""
+        """Return this excerpt without the sounds of some arrays; its times do not change."""
         powers = {name: power for name, power in self.powers.items() if name not in arrays}
         return Excerpt(self.sounds.without(arrays), self.start_ns, self.end_ns, powers)
 
     def with_backfill(self, backfilled: Mapping[str, BackfilledSound]) -> Excerpt:
-        """Return this excerpt with the sounds of requested frames added; the times stay."""
+        """Return this excerpt with the sounds of requested frames added; its times do not change."""
         joined = Excerpt(self.sounds.copy(), self.start_ns, self.end_ns, dict(self.powers))
         for name, sound in backfilled.items():
             powers = np.array([frame.power for frame in sound.frames])

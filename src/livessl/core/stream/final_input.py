@@ -30,7 +30,7 @@ class FinalInput:
     frames_ahead : callable
         Returns by how many frames an array's own frame indices are ahead of the joint ones.
     hold_ns, hold_bytes : int
-        Limits on the frames that are held for an array that is away: see `HeldFrames`.
+        Limits on the frames that are held for an absent array: see `HeldFrames`.
     """
 
     def __init__(

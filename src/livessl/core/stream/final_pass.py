@@ -1,8 +1,8 @@
-"""Early and final results: two passes over the same messages in one class.
+"""Makes early and final results, by two passes over the same messages. It reads no clock.
 
-The early pass closes a frame index at its deadline, whatever is missing. The final pass closes it when every array has
-sent all its frames of it, however late and in whatever order they came; its events replace the early ones. While
-nothing is late both keep in step, and only the final pass reports events. It reads no clock.
+The early pass closes a frame index at its deadline, even if frames are missing. The final pass closes a frame index
+when every array has sent all its frames, in whatever order and however late; its events replace the early ones. If no
+frame is late, both passes close the same frame indices, and only the final pass reports events.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from livessl.core.stream.update_schedule import UpdateSchedule
 from livessl.core.types import FRAME_NS, BackfillRequest, Event, Frame, Message, Output, Window
 
 STRIDE: Final = 40
-"""Number of frame indices that the final pass closes at a time: two seconds. After a stride with events, the early pass
-runs again before the next one."""
+"""Largest number of frame indices that the final pass closes at one time: two seconds. If there were events among them,
+the early pass runs again before the final pass continues."""
 
 FINAL: Final = Role(updates=False, watches_health=False)
-"""Role of the final pass. It receives all frames in order, and so it is the one that learns the clocks' offsets."""
+"""Role of the final pass. It receives all frames in order, so it learns the offsets of the clocks."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,20 +39,20 @@ class FinalResults:
 
 
 class TwoPassFusion:
-    """The early and the final pass.
+    """Runs the early and the final pass.
 
     Parameters
     ----------
     state : SiteState
-        What both share.
+        State that both passes share.
     arrays : iterable of str
         Arrays whose sound is awaited.
     settled : int or None
-        Frame index before which all results are final already; None begins anew.
+        Frame index before which all results are already final; None begins anew.
     newest_only : bool
         Whether the early pass keeps up with live sound: see `Role`.
     hold_ns, hold_bytes : int
-        Limits on the frames that are held for an array that is away: see `HeldFrames`.
+        Limits on the frames that are held for an absent array: see `HeldFrames`.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class TwoPassFusion:
         self._early = Fusion(state, Role(newest_only=newest_only, learns_clocks=False))
         self._arrays = tuple(arrays)
         self.input = FinalInput(state, self._arrays, self._ahead, hold_ns=hold_ns, hold_bytes=hold_bytes)
-        """Frames that have come for the final pass."""
+        """Frames that have arrived for the final pass."""
         self.asked = dict.fromkeys(self._arrays, 0)
         """Number of backfill requests to each array."""
         self.helped = dict.fromkeys(self._arrays, 0)
@@ -83,7 +83,7 @@ class TwoPassFusion:
 
     @property
     def settled_of(self) -> dict[str, int]:
-        """The frame index `settled` for each array, as the array's node counts by its own clock."""
+        """The frame index `settled` for each array, by the clock of the array's node."""
         settled = self.settled
         return {} if settled is None else {name: settled + self._ahead(name) for name in self._arrays}
 
@@ -94,17 +94,17 @@ class TwoPassFusion:
 
     @property
     def located(self) -> frozenset[str] | None:
-        """Arrays that the event that goes on is located from; None for all, and while there is no event."""
+        """Arrays from which the current event is located; None for all, and while there is no event."""
         return self._early.located
 
     def relieve(self, relief: Relief) -> None:
-        """Shed this from now on: see `load_policy`."""
+        """Shed the work that `relief` names from now on: see `load_policy`."""
         self._state.relieve(relief)
 
     def take_over(self, set_up: ArraySetUp) -> None:
         """Locate with another set-up of the same arrays from now on.
 
-        Events that have begun are located as before in both passes; those that begin later, with the other set-up.
+        Events that have begun are located with the former set-up in both passes, later events with the new one.
         """
         closed = self._early.closed
         for state in (self._state, self._final_state):
@@ -112,7 +112,7 @@ class TwoPassFusion:
         self._state.votes.clear()
 
     def prepare(self, array: str, sample_rate_hz: float) -> None:
-        """Compute what an array's sound will need, so that its first event does not wait for it."""
+        """Compute the tables for an array's sound, so that its first event does not wait for them."""
         self._early.prepare(array, sample_rate_hz)
 
     def power_maps(self, window: Window, separately: Collection[str] | None = None) -> PowerMaps:
@@ -132,7 +132,7 @@ class TwoPassFusion:
         ----------
         array : str
         backlog : (int, int) or None
-            Frame indices of the oldest kept frame and of the first live one; None if no backlog is left.
+            Frame indices of the oldest kept frame and of the first live frame; None if no backlog is left.
         now_ns : int
         answers : bool
             Whether the node answers backfill requests.
@@ -152,7 +152,7 @@ class TwoPassFusion:
         self._state.exclude(arrays)
 
     def step(self, messages: Iterable[Message], now_ns: int) -> list[Output | FinalResults]:
-        """Take in messages, in any order between arrays; return what there is to report."""
+        """Take in messages, in any order between arrays; return the results to report."""
         settled = self.settled
         if settled is not None and is_ahead_of_clock(settled, now_ns):
             self._begin(None)  # the server's clock was set back: final results lie in the future now
@@ -222,7 +222,7 @@ class TwoPassFusion:
         return [*requests, FinalResults(events, settled)] if events and settled is not None else [*requests]
 
     def _close(self, end: int) -> list[Output]:
-        """Let the final pass close everything up to a frame index."""
+        """Let the final pass close all frame indices up to one."""
         before = {name: self._ahead(name) for name in self._arrays}
         outputs = self._final.step(self.input.held.pop_until(end), (end + 1) * FRAME_NS, complete_until=end)
         if any(self._ahead(name) != frames for name, frames in before.items()):
@@ -230,7 +230,7 @@ class TwoPassFusion:
         return outputs
 
     def _stride_end(self, position: int, frontier: int) -> int:
-        """Return the frame index up to which the final pass closes in one go.
+        """Return the frame index up to which the final pass closes at one time.
 
         During silence this is the frontier, or the frame index before the first held frame.
         """

@@ -1,8 +1,8 @@
-"""Fusion: the frames of all arrays become updates, events and tracks. It reads no clock.
+"""Makes updates, events and tracks from the frames of all arrays. It reads no clock.
 
-`Fusion.step(messages, now_ns)` is the only entry for messages, live and replayed. It composes the stages. `Alignment`
-puts the frames on one frame index and closes it, `EvidenceCollector` correlates them and collects excerpts, and
-`Verdicts` locates and judges these. `UpdateSchedule` says which windows are located while a sound goes on,
+`Fusion.step(messages, now_ns)` is the only entry for messages, live and replayed. It uses these stages: `Alignment`
+assigns the frames to joint frame indices and closes them, `EvidenceCollector` correlates frames and collects excerpts,
+`Verdicts` locates and judges excerpts, `UpdateSchedule` chooses the windows that are located while a sound continues,
 `EventReporter` decides when an event is reported, and `Tracker` follows the sources.
 """
 
@@ -31,15 +31,15 @@ class Role:
     Parameters
     ----------
     updates : bool
-        It locates windows while a sound goes on.
+        Whether the pass locates windows while a sound continues.
     newest_only : bool
-        It keeps up with live sound: of several windows that are due at once only the newest is located, and frames are
-        correlated before a sound begins.
+        Whether the pass keeps up with live sound: if several windows are due at once, only the newest is located, and
+        frames are correlated before a sound begins.
     learns_clocks : bool
-        The offsets of the arrays' clocks are learned from its events. A pass that does not learn takes over, before
-        every sound, what another has learned.
+        Whether the offsets of the arrays' clocks are learned from the events of this pass. Another pass uses these
+        offsets from its next sound on.
     watches_health : bool
-        It examines frames for dead microphones.
+        Whether the pass examines frames for dead microphones.
     """
 
     updates: bool = True
@@ -58,7 +58,7 @@ class Fusion:
     Parameters
     ----------
     state : SiteState
-        What it shares with other passes over the same messages.
+        State that all passes over the same messages share.
     role : Role
     """
 
@@ -81,7 +81,7 @@ class Fusion:
     # --- steps
 
     def step(self, messages: Iterable[Message], now_ns: int, *, complete_until: int | None = None) -> list[Output]:
-        """Take in messages, in any order between arrays; return what there is to report.
+        """Take in messages, in any order between arrays; return the results to report.
 
         Parameters
         ----------
@@ -89,7 +89,7 @@ class Fusion:
         now_ns : int
             Site time now.
         complete_until : int, optional
-            Frame index up to which all messages of all arrays have come with these.
+            Frame index up to which all messages of all arrays have arrived, including these.
         """
         outputs = self._start_over() if self._alignment.is_set_back(now_ns) else []
         if not self._role.learns_clocks and self._event is None:
@@ -116,7 +116,7 @@ class Fusion:
     # --- other input
 
     def prepare(self, array: str, sample_rate_hz: float) -> None:
-        """Compute what an array's sound will need, so that its first event does not wait for it."""
+        """Compute the tables for an array's sound, so that its first event does not wait for them."""
         self._state.prepare(array, sample_rate_hz)
 
     def begin(self, frame_index: int) -> None:
@@ -157,12 +157,12 @@ class Fusion:
 
     @property
     def located(self) -> frozenset[str] | None:
-        """Arrays that the event that goes on is located from; None for all, and while there is no event."""
+        """Arrays from which the current event is located; None for all, and while there is no event."""
         return self._collector.located
 
     @property
     def needed_from(self) -> int | None:
-        """First frame index whose frames may be needed yet; None before the first message."""
+        """First frame index whose frames may still be needed; None before the first message."""
         following = self._alignment.next
         if following is None:
             return None
@@ -182,9 +182,9 @@ class Fusion:
         ----------
         now_ns : int
         nodes : mapping of array to NodeReport, optional
-            What a server knows of the arrays besides their messages.
+            Facts about the arrays that are not in their messages.
         levels : bool
-            Whether it has channel powers, which cost a transform for each array.
+            Whether the status has channel powers, which require a transform for each array.
         """
         return self._alignment.status(now_ns, nodes or {}, levels=levels)
 
@@ -215,7 +215,7 @@ class Fusion:
         return outputs
 
     def _close_ready(self) -> list[Output]:
-        """Close all frame indices that need not wait; return what there is to report."""
+        """Close all frame indices that need not wait; return the results to report."""
         outputs = self._skip_gap()
         while True:
             outputs += self._report_backfilled()
@@ -272,7 +272,7 @@ class Fusion:
     # --- updates
 
     def _update(self, event: PendingEvent, last: int | None) -> list[Output]:
-        """Locate the window that ends with a frame index, if its event still goes on; None is no window."""
+        """Locate the window that ends with a frame index, if its event still continues; None for no window."""
         if last is None or event.state is not EventState.OPEN or last < event.start:
             return []
         excerpt = self._collector.window(last)
@@ -303,7 +303,7 @@ class Fusion:
         return self._report(event)
 
     def _report(self, event: PendingEvent) -> list[Output]:
-        """Report an event now, with the frames that have come."""
+        """Report an event now, with the frames that have arrived."""
         results = self._reporter.report(event)
         self._event = None
         self._collector.end_event()

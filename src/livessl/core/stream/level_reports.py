@@ -1,4 +1,4 @@
-"""Reports of channel levels, once a second of sound, for the marks that carry them."""
+"""Makes reports of channel levels, one for each second of sound, which marks carry."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from livessl.core.commission.levels import LevelMeter
 from livessl.core.types import ChannelLevel, Float32Array, IntArray
 
 REPORT_S: Final = 1.0
-"""Interval of reports, in seconds of sound. Each takes the levels of about that time, so they leave nothing out."""
+"""Interval of reports, in seconds of sound. Each report has the levels of this interval, so that no sound is left
+out."""
 
 
 class LevelReports:
@@ -54,7 +55,7 @@ class LevelReports:
             )
 
     def take(self, array: str) -> tuple[ChannelLevel, ...]:
-        """Return the report of an array that was not taken yet; an empty one if there is none."""
+        """Return the report of an array that was not taken yet; an empty report if there is none."""
         return self._waiting.pop(array, ())
 
 

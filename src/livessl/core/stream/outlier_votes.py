@@ -1,4 +1,4 @@
-"""Which arrays were outliers in the last events, and which are therefore suspect."""
+"""Counts which arrays were outliers in the last events, and decides which arrays are suspect."""
 
 from __future__ import annotations
 
@@ -8,19 +8,20 @@ from typing import Final
 from livessl.core.locate.estimator import Localization
 
 VOTES: Final = 10
-"""Number of last events that an array's votes are kept of."""
+"""Number of latest events for which the votes of an array are kept."""
 
 LEAST_VOTES: Final = 3
-"""Number of outlier votes from which on an array is suspect, if they are also more than half of its last `VOTES` votes.
-As many agreements in a row clear it. It is also the least number of arrays of which a consensus is counted."""
+"""Number of outlier votes from which an array is suspect, if they are also more than half of its last `VOTES` votes.
+The same number of consecutive agreements clears the array. It is also the least number of arrays in a counted
+consensus."""
 
 Votes = tuple[tuple[int, float | None], ...]
-"""One entry for each of the last events: the frame index at which it began, and the angle in degrees by which the array
-was off; None where it agreed with the others."""
+"""One entry for each of the last events: the frame index at which it began, and the error of the array's
+direction in degrees; None if the array agreed with the others."""
 
 
 class OutlierVotes:
-    """Votes of all arrays. Each array's votes are replaced, never changed: any thread may read them.
+    """The votes of all arrays. Any thread may read the votes of an array, which are replaced and never changed.
 
     Parameters
     ----------
@@ -51,7 +52,7 @@ class OutlierVotes:
         start : int
             Frame index at which the event began.
         found : Localization
-            Its location. Without a consensus of at least `LEAST_VOTES` arrays nothing is counted.
+            Localization of the event. It is counted only if at least `LEAST_VOTES` arrays are in the consensus.
         detected_by : iterable of str
             Arrays that detected the event by themselves.
         """

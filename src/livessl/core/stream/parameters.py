@@ -1,4 +1,4 @@
-"""Parameters of the fusion. It loads nothing that localizes, so that the site's models can take their defaults here."""
+"""Parameters of the fusion, with their defaults. The models of the site file import them, so it loads no estimator."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from livessl.core.stream.activity import ActivityParameters
 from livessl.core.types import FRAME_S
 
 BACKFILL_WAIT_S: Final = 0.3
-"""Time, in seconds, that a live event waits for requested frames: long against the round trip to a node, short for a
-person who waits for the event."""
+"""Time, in seconds, for which a live event waits for requested frames. It is much longer than the round trip to a node,
+but short for a person who waits for the event."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,17 +20,17 @@ class FusionParameters:
     Parameters
     ----------
     deadline_s : float
-        Time that a frame index stays open for a late array.
+        Longest time for which a frame index stays open for a late array.
     backfill_wait_s : float
-        Time that an event waits for requested frames.
+        Longest time for which an event waits for requested frames.
     window_s, update_s : float
-        Length of the windows that updates are located from, and the time between two updates.
+        Length of the windows from which updates are located, and the time between two updates.
     max_event_s : float
         Longest event; a longer sound is split into several.
     min_arrays : int
         Least number of arrays; an event detected by fewer is refused.
     sources, live_sources : int
-        Greatest number of sources, 1 or 2, searched in an event, and in a window of a sound that goes on.
+        Largest number of sources, 1 or 2, that are searched for in an event, and in a window of a continuing sound.
     activity : ActivityParameters
         The activity rule, as the nodes use it. An event ends after a quiet hang-over.
     """

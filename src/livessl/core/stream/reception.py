@@ -1,8 +1,8 @@
-"""Reception of one array for the final pass (`final_input`); the early pass uses `ArrayStream`.
+"""Records which frames of one array have arrived for the final pass (`final_input`), live and as backlog.
 
-It records how much of the array's sound has come, live and as backlog, in frame indices of the array's own clock. A
-node that reconnects sends its backlog between live frames. Until the backlog is complete, frames are certain only up to
-its last one, even if later live frames have come.
+Frame indices are those of the array's own clock. A node that reconnects sends its backlog between live frames. Until
+the backlog is complete, frames are complete only up to the last backlog frame, even if later live frames have arrived.
+The early pass uses `ArrayStream` instead.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from livessl.core.stream.array_health import is_connected
 
 @dataclass(slots=True)
 class FinalReception:
-    """The frames of one array that have come for the final pass."""
+    """The frames of one array that have arrived for the final pass."""
 
     live_until: int | None = None
     backlog_until: int | None = None  # None while there is no backlog
@@ -26,15 +26,15 @@ class FinalReception:
 
     @property
     def known_until(self) -> int | None:
-        """Frame index up to which all frames have come; None before the first message."""
+        """Frame index up to which all frames have arrived; None before the first message."""
         return self.live_until if self.backlog_until is None else self.backlog_until
 
     def is_connected(self, now_ns: int) -> bool:
-        """Return whether its node has sent anything in the last `LOST_NS`."""
+        """Return whether the node has sent any message in the last `LOST_NS`."""
         return is_connected(self.last_message_ns, now_ns)
 
     def is_backlog(self, frame_index: int) -> bool:
-        """Return whether a frame belongs to the backlog, which the node kept from before its connection."""
+        """Return whether a frame belongs to the backlog, the frames from before the node's connection."""
         return self.backlog_until is not None and self.live_from is not None and frame_index < self.live_from
 
     def greet(self, backlog: tuple[int, int] | None, now_ns: int) -> None:
@@ -43,7 +43,7 @@ class FinalReception:
         Parameters
         ----------
         backlog : (int, int) or None
-            Frame indices of the oldest kept frame and of the first live one; None if no backlog is left.
+            Frame indices of the oldest kept frame and of the first live frame; None if no backlog is left.
         now_ns : int
         """
         self.touch(now_ns)
@@ -56,23 +56,23 @@ class FinalReception:
             self.backlog_until = None
 
     def leave(self) -> None:
-        """Note that its node has ended on purpose."""
+        """Note that the node has ended on purpose."""
         self.has_left = True
 
     def touch(self, now_ns: int) -> None:
-        """Note that its node has sent something."""
+        """Note that the node has sent a message."""
         self.last_message_ns, self.has_left = now_ns, False
 
     def take_mark(self, frame_index: int) -> None:
-        """Take in a mark: all live sound up to it has come."""
+        """Take in a mark, with which all live frames up to its frame index have arrived."""
         self.live_until = later(self.live_until, frame_index)
 
     def take_backlog(self, frame_index: int) -> None:
-        """Take in the index of a backlog frame, new or not: all of the backlog up to it has come."""
+        """Take in the index of a backlog frame, new or not, with which the backlog up to it has arrived."""
         self.backlog_until = later(self.backlog_until, frame_index)
 
     def is_new(self, frame_index: int) -> bool:
-        """Return whether a frame has not come before: it is newer than all live sound of the array, or was given up."""
+        """Return whether a frame has not arrived before: it is newer than all live sound, or was no longer awaited."""
         is_newest = self.live_until is not None and self.live_until < frame_index
         is_given_up = self.given_up is not None and self.given_up[0] <= frame_index < self.given_up[1]
         return frame_index not in self.seen and (is_newest or is_given_up)
@@ -84,7 +84,7 @@ class FinalReception:
             self.live_until = later(self.live_until, frame_index)
 
     def forget(self, before: int) -> None:
-        """Forget which frames have been seen before the frame index before which all results are final."""
+        """Forget the frames before a frame index before which all results are final."""
         known, given_up = self.known_until, self.given_up
         if known is None:  # it has sent nothing in this run, of which `before` is the first such frame index
             self.given_up = (before if given_up is None else given_up[0], before)

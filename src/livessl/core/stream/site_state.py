@@ -18,13 +18,13 @@ from livessl.core.stream.parameters import FusionParameters
 from livessl.core.types import ArraySpec, Frame, Message
 
 MOST_CORRELATED: Final = 32
-"""Most arrays whose frames are correlated for an event: the clearest arrays, twice as many as the default method
-locates with. Correlation is most of what an array costs, and that of further arrays does not move the position."""
+"""Largest number of arrays whose frames are correlated for an event: the clearest arrays, twice as many as the default
+method uses. Correlation takes most of the time for an array, and further arrays do not move the position."""
 
 
 @dataclass(frozen=True, slots=True)
 class ArraySetUp:
-    """The arrays at their places, and the estimator and cache that are made for these places.
+    """The arrays with their poses, and the estimator and cache that belong to these poses.
 
     Parameters
     ----------
@@ -54,22 +54,22 @@ class _Conditions:
 
 
 class SiteState:
-    """State of a site. The passes over its messages share everything but the set-up of the arrays.
+    """State of a site. All passes over its messages share the state, except the set-up of the arrays.
 
     Parameters
     ----------
     site : str
-        Name that event ids begin with.
+        Name of the site, with which event ids begin.
     arrays : sequence of ArraySpec
     estimator : Estimator
     parameters : FusionParameters
     clock_offsets : ClockOffsets or None
-        Offsets of the arrays' clocks, learned from events; None takes all clocks to agree.
+        Offsets of the arrays' clocks, learned from events; with None, all clocks count as equal.
     for_each : ForEach or None
         Correlates several arrays, perhaps in parallel; with None, one after the other.
     free_axes : sequence of int
-        Axes along which the search volume is not flat. Where an estimator returns no covariance, the error of the
-        set-up has these axes.
+        Axes along which the search volume is not flat. If an estimator returns no covariance, the error of the set-up
+        has these axes.
     """
 
     def __init__(
@@ -127,7 +127,7 @@ class SiteState:
     def advance(self, frame_index: int) -> bool:
         """Use the set-up that applies at a frame index before which all events are reported.
 
-        Return whether it is another one than before.
+        Return whether the set-up has changed.
         """
         before = self._set_up
         while self._following and self._following[0][0] <= frame_index:
@@ -135,20 +135,20 @@ class SiteState:
         return self._set_up is not before
 
     def use_newest(self) -> None:
-        """Use the set-up that was given last at once, whatever the frame indices from which set-ups were to apply."""
+        """Use the newest set-up at once, even if it was to apply from a later frame index."""
         if self._following:
             self._set_up = self._following[-1][1]
             self._following.clear()
 
     def start_over(self) -> None:
-        """Forget what was learned of the arrays, because the server's clock was set back."""
+        """Forget all facts learned about the arrays, because the server's clock was set back."""
         self.use_newest()
         self.cache.clear()
         self.votes.clear()
         self.channel_faults.clear()
 
     def prepare(self, array: str, sample_rate_hz: float) -> None:
-        """Compute in advance what locating an array's sound needs, for the set-up in use and those that follow."""
+        """Compute the tables for an array's sound in advance, for the set-up in use and the ones that follow."""
         for set_up in (self._set_up, *(following for _, following in self._following)):
             set_up.estimator.prepare(array, sample_rate_hz)
 
@@ -188,7 +188,7 @@ class SiteState:
         return message
 
     def set_answers(self, array: str, answers: bool) -> None:
-        """Record whether the node of an array answers backfill requests; at first no node is known to."""
+        """Record whether the node of an array answers backfill requests; initially no node does."""
         answering = self._conditions.answering
         (answering.add if answers else answering.discard)(array)
 

@@ -1,11 +1,11 @@
-"""Measures the power of a frame in the band without steady noise such as hum and rumble. It reads no clock.
+"""Measures the in-band power of frames without steady noise such as hum and rumble. It reads no clock.
 
-A mains hum, a fan's tone or rumble can be far above everything else in the band, so that a sound which is 30 dB above
-all the rest hardly raises the level. The background is therefore tracked in every bin of the frames' spectra, as the
-least power of a few seconds. Bins whose background stands far above the others' are *loud*; in them only what exceeds
-their usual power by far counts. Bins outside the band may be loud as well and leak into it, which a Hann window
-prevents. That window weakens what is short and lies at the edge of a frame. Without loud bins the level is the plain
-power in the band.
+Mains hum, the tone of a fan or rumble can be far above everything else in the band. A sound that is 30 dB above the
+rest of the background then hardly raises the level. The background is therefore tracked in every bin of the frames'
+spectra, as the smallest power of a few seconds. Bins whose background is far above that of the others are *loud*. In a
+loud bin, only power far above the usual power counts. Bins outside the band may also be loud and leak into the band, so
+a Hann window is used if there are loud bins. (This window reduces short sounds at the edge of a frame.) Without loud
+bins, the level is the plain power in the band.
 """
 
 from __future__ import annotations
@@ -21,40 +21,40 @@ from livessl.core.correlate.band import band_bins
 from livessl.core.types import FRAME_S, BoolArray, ComplexArray, Float32Array, FloatArray
 
 LOUD: Final = 30.0
-"""Ratio of a bin's background to the median over the band, 15 dB, above which it is loud. A tone that fills three of
-300 bins must be about so far above the others to double the level."""
+"""Ratio of a bin's background to the median over the band, 15 dB, above which the bin is loud. A tone that fills three
+of 300 bins must be about that far above the others to double the level."""
 
 EXCESS: Final = 25.0
 """Ratio of a frame's power to the usual power, 14 dB, above which sound counts in a loud bin. The usual power is the
-least mean of half a second, for rumble 0.6 of the mean; a bin of rumble exceeds it by so much in one of three million
-frames."""
+smallest mean of half a second, which is 0.6 of the mean for rumble. A bin with rumble exceeds this ratio in one of
+three million frames."""
 
 BEYOND: Final = 1.25
-"""Ratio to the band's upper edge of the highest frequency at which a tone may leak into the band."""
+"""Highest frequency at which a tone may leak into the band, relative to the upper edge of the band."""
 
 NEW_HUM: Final = 0.25
-"""Ratio of the usual level without the bins that are loud now to that without those that were loud before, below which
-a hum has just been recognized."""
+"""Ratio of two usual levels below which a new hum is recognized: the level without the bins that are loud now, over the
+level without the bins that were loud before."""
 
 _SMOOTHING: Final = 5
-"""Number of frames averaged before the minimum is taken: as in `livessl.core.stream.activity`."""
+"""Number of frames averaged before the minimum is taken; `livessl.core.stream.activity` uses the same number."""
 
 _BLOCK: Final = 10
-"""Number of frames of which a minimum is kept, so that not every frame has to be."""
+"""Number of frames that share one stored minimum, so that not every frame has to be stored."""
 
 _LEAST_BINS: Final = 16
-"""Least number of bins in the band for their median to be a background."""
+"""Least number of bins in the band from which their median is used as background."""
 
 
 class SteadyBackground:
-    """Tracks the background of one array's frames, and returns their power without what is loud and steady in it.
+    """Tracks the background of one array's frames, and returns their power without loud and steady parts.
 
     Parameters
     ----------
     sample_rate_hz : float
     band_hz : (float, float)
     window_s : float
-        Length of the window whose least power is the background.
+        Length of the window whose smallest power is the background.
     keep : float
         Factor by which the maximum of the level decays from frame to frame.
     """
@@ -87,7 +87,8 @@ class SteadyBackground:
         ----------
         samples : (C, K, n) float32
         plain : (C, K, n // 2 + 1) complex64
-            Their spectra without a window, from which those with one follow: the window is a constant and one cosine.
+            Spectra without a window. The spectra with a Hann window follow from them, because this window is the sum of
+            a constant and a cosine.
         """
         if samples.shape[2] == self._count:
             spectra = _windowed(plain, self._bins.stop, self._count)
@@ -100,8 +101,8 @@ class SteadyBackground:
     def learn(self, spectrum: FloatArray) -> bool:
         """Take in the spectrum of the next frame; return whether it shows a hum that was not known before.
 
-        Then the usual level without what is loud now is far below the usual level without what was loud until now, and
-        what is known of levels is no longer true. The sound that is going on plays no part in it.
+        In that case the usual level without the bins that are loud now is far below the usual level without the bins
+        that were loud before, and earlier levels are no longer valid. The current sound does not affect this.
         """
         loud = self._loud
         self._learn(spectrum)
@@ -134,7 +135,7 @@ class SteadyBackground:
 
     @property
     def usual_power(self) -> float:
-        """Usual level, full scale squared, without what is loud and steady now."""
+        """Usual level, full scale squared, without the parts that are loud and steady now."""
         return self._usual_power(self._loud)
 
     def _usual_power(self, loud: BoolArray) -> float:
@@ -142,20 +143,20 @@ class SteadyBackground:
 
     @property
     def changing_maximum(self) -> float:
-        """Decaying maximum of the level, full scale squared, without what is loud and steady now.
+        """Decaying maximum of the level, full scale squared, without the parts that are loud and steady now.
 
-        It is the sum of the bins' maxima, and so an upper bound.
+        It is an upper bound: the sum of the maxima of the bins.
         """
         return self.changing_power(self._maximum, np.inf)
 
     def changing_power(self, spectrum: FloatArray, power: float) -> float:
-        """Return the power of a frame in the band without what is loud and steady.
+        """Return the in-band power of a frame without its loud and steady parts.
 
         Parameters
         ----------
         spectrum : (F,) float64
         power : float
-            The plain power in the band, which is returned if nothing is loud.
+            The plain in-band power, which is returned if no bin is loud.
         """
         if not self._is_any_loud:
             return power
@@ -165,7 +166,7 @@ class SteadyBackground:
 
 
 def _windowed(plain: ComplexArray, bins: int, count: int) -> ComplexArray:
-    """Return the first bins of the spectra of `count` samples with a Hann window, from those without one (C, K, F)."""
+    """Return the first bins of the spectra of `count` samples with a Hann window, from plain spectra (C, K, F)."""
     above = plain[..., bins : bins + 1]
     if not above.size:
         above = np.conj(plain[..., count - bins : count - bins + 1])
@@ -174,7 +175,7 @@ def _windowed(plain: ComplexArray, bins: int, count: int) -> ComplexArray:
 
 
 def _median(values: FloatArray) -> float:
-    """Return the median; NumPy's takes ten times as long for a few hundred values."""
+    """Return the median; `numpy.median` takes ten times as long for a few hundred values."""
     middle = len(values) // 2
     if len(values) % 2:
         return float(np.partition(values, middle)[middle])

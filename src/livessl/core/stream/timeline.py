@@ -1,4 +1,4 @@
-"""Sample index to site time, and the cutting of blocks into frames; it reads no clock."""
+"""Converts sample indices to site time, and cuts blocks into frames. It reads no clock."""
 
 from __future__ import annotations
 
@@ -10,31 +10,33 @@ import numpy as np
 from livessl.core.types import FRAME_NS, Block, ClockState, Float32Array
 
 MEMORY_S: Final = 60.0
-"""Time constant of the line fit, in seconds: long against a block's jitter, short against a crystal's warming up."""
+"""Time constant of the line fit, in seconds: longer than the jitter of blocks, shorter than the warm-up of a
+crystal."""
 
 STEP_NS: Final = 200_000_000
-"""Deviation from the line, in nanoseconds, that is no jitter; scheduling delays stay below it."""
+"""Deviation from the line, in nanoseconds, that is too large for jitter; scheduling delays are smaller."""
 
 STEP_BLOCKS: Final = 3
-"""Number of such stamps in a row that are a step of the clock; fewer are late callbacks."""
+"""Number of consecutive stamps with such a deviation that count as a step of the clock; fewer are late callbacks."""
 
 LOCKED_S: Final = 2.0
-"""Length of sound, in seconds, needed before the fit is trusted."""
+"""Length of sound, in seconds, that is needed before the fit is used."""
 
 _SLOPE_RIDGE_S2: Final = 1e4
-"""Weight of the prior of the drift: (10 ms of stamp jitter / 100 ppm of drift) squared. It fades as blocks come in."""
+"""Weight of the prior of the drift: (10 ms of stamp jitter / 100 ppm of drift) squared. Its influence decreases with
+the number of blocks."""
 
 _NOISE_FACTOR: Final = 3.0
 """Multiple of the standard deviation of the drift that counts as its error."""
 
 _BOUNDARY: Final = 0.4
-"""Rounding of frame boundaries to samples. It is not a half: at 22.05 kHz every other boundary would be a tie."""
+"""Rounding of frame boundaries to samples. It is not 0.5, because at 22.05 kHz every other boundary would be a tie."""
 
 
 class Timeline:
-    """Running line fit of (sample index, arrival stamp): one block's stamp is noise, the line is not.
+    """Running line fit of (sample index, arrival stamp), because the stamps of single blocks are noisy.
 
-    Exponentially forgetting least squares of the stamps' residuals from the nominal rate.
+    The fit is an exponentially forgetting least-squares fit of the stamps' residuals from the nominal rate.
 
     Parameters
     ----------
@@ -56,7 +58,7 @@ class Timeline:
 
     @property
     def started(self) -> bool:
-        """True once the first stamp has come."""
+        """True once the first stamp has arrived."""
         return self._origin is not None
 
     @property
@@ -66,9 +68,10 @@ class Timeline:
 
     @property
     def drift_error_ppm(self) -> float | None:
-        """Error that `drift_ppm` may have, in parts per million; None as long as the fit is not trusted.
+        """Possible error of `drift_ppm`, in parts per million; None as long as the fit is not used.
 
-        It is what the prior still holds back of the drift, and three standard deviations by the stamps' jitter.
+        The error is the sum of the part of the drift that the prior still suppresses, and three standard deviations due
+        to the jitter of the stamps.
         """
         if self._last_x_s < LOCKED_S or self._cxx <= 0.0:
             return None
@@ -84,7 +87,7 @@ class Timeline:
         return ClockState.STEPPED if self.steps else ClockState.SETTLING
 
     def update(self, index: int, stamp_ns: int) -> bool:
-        """Take in one block's stamp; return True where the clock has stepped and the fit starts anew."""
+        """Take in the stamp of a block; return True if the clock has stepped and the fit starts anew."""
         if self._origin is None:
             self._origin = (index, stamp_ns)
         stepped = False
@@ -139,7 +142,7 @@ class Timeline:
 
 @dataclass(frozen=True, slots=True)
 class Cut:
-    """One frame index of all of a device's channels: `samples` (channels, n) from site time `time_ns` on."""
+    """All channels of a device at one frame index: `samples` (channels, n) from site time `time_ns` on."""
 
     frame_index: int
     time_ns: int
@@ -148,7 +151,7 @@ class Cut:
 
 @dataclass(frozen=True, slots=True)
 class FramerState:
-    """State of a framer that marks report: its counters, and the drift and state of its clock."""
+    """State of a framer, which marks report: its counters, and the drift and state of its clock."""
 
     overflows: int
     lost_frames: int
@@ -157,7 +160,7 @@ class FramerState:
 
 
 class Framer:
-    """Cuts a device's blocks on the grid of 50 ms; frames are contiguous, now and then a sample longer.
+    """Cuts a device's blocks at multiples of 50 ms. Frames are contiguous, so some are one sample longer than others.
 
     Parameters
     ----------
@@ -180,7 +183,7 @@ class Framer:
         return FramerState(self.overflows, self.lost_frames, self.timeline.drift_ppm, self.timeline.state)
 
     def push(self, block: Block) -> list[Cut]:
-        """Take in a block; return the frames it completes. A gap drops the frame that it tears."""
+        """Take in a block; return the frames that it completes. A frame with a gap in it is dropped."""
         count = block.samples.shape[1]
         if count == 0:
             return []

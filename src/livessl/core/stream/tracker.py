@@ -1,9 +1,9 @@
-"""Tracks: a constant-velocity Kalman filter for each source, updated with estimates; time is an argument.
+"""Tracks sources, with a constant-velocity Kalman filter for each source. Time is an argument.
 
-The estimates of one moment are assigned to the tracks that make all of them most likely together, so that two sources
-which cross keep their tracks by their velocities. A source that turned round in a pause is also searched where it was
-last located. An estimate moves its track by its covariance and its confidence: least along the line of sight, where the
-arrays resolve least.
+The estimates of one time are assigned to the tracks for which all assignments together are most likely, so that two
+sources that cross keep their tracks by their velocities. A source that turned round in a pause is also searched for at
+its last position. The covariance and the confidence of an estimate decide how far it moves its track: least along the
+line of sight, where arrays are least exact.
 """
 
 from __future__ import annotations
@@ -17,14 +17,15 @@ import numpy as np
 from livessl.core.types import Estimate, FloatArray, Track, TrackState
 
 ACCELERATION_M_S2: Final = 1.0
-"""Standard deviation of the acceleration in the motion model, in m/s^2: a person who sets off."""
+"""Standard deviation of the acceleration in the motion model, in m/s^2: that of a person who starts to walk."""
 
 START_SPEED_M_S: Final = 1.0
-"""Standard deviation of a new track's velocity, in m/s: a walking person."""
+"""Standard deviation of a new track's velocity, in m/s: that of a walking person."""
 
 GATE_M: Final = 1.0
-"""Distance, in metres, from a track's predicted position and from its last one beyond which an estimate that is also
-outside its uncertainty starts a new track. An estimate with a greater standard deviation starts none beside a track."""
+"""Distance, in metres, from the predicted and the last position of a track beyond which an estimate, if it is also
+outside the uncertainty, starts a new track. An estimate with a greater standard deviation starts no track beside
+another."""
 
 GATE_SIGMAS2: Final = 11.34
 """Squared Mahalanobis distance of the gate: 99 % of a chi-square with three degrees of freedom."""
@@ -36,11 +37,11 @@ _OUTSIDE: Final = 1e9
 """Cost of an assignment outside every gate; finite, because the costs are summed."""
 
 CONFIRM_S: Final = 1.0
-"""Time, in seconds, within which a second estimate must confirm a new track while another source is followed: a single
-estimate beside it is a reflection more often than a new source."""
+"""Time, in seconds, within which a second estimate must confirm a new track while another source is followed. A single
+estimate beside another source is more often a reflection than a new source."""
 
 MIN_STD_M: Final = 0.05
-"""Least standard deviation of an estimate, in metres; models of the room are not better than this."""
+"""Least standard deviation of an estimate, in metres; models of the room are not more exact."""
 
 WRONG_STD_M: Final = 0.5
 """Standard deviation, in metres along each axis, of a wrong estimate; the confidence is the probability that an
@@ -57,15 +58,15 @@ class _Filter:
     confirmed: bool = False
 
     def predicted(self, time_ns: int) -> _Motion:
-        """Return its motion if it goes on at its velocity."""
+        """Return the motion of the source if it continues at its velocity."""
         return _moved(self.state, self.covariance, time_ns - self.time_ns)
 
     def set_off_anew(self, time_ns: int) -> _Motion:
-        """Return its motion if it set off in any direction from its last position."""
+        """Return the motion of the source if it starts in any direction from its last position."""
         return _moved(*_at_rest(self.last.position_m, self.last.covariance_m2), time_ns - self.last.time_ns)
 
     def update(self, motion: _Motion, estimate: _Measurement) -> None:
-        """Update it with an estimate, after a motion."""
+        """Update the track with an estimate, after a motion."""
         before = motion.covariance
         gain = before[:, :3] @ np.linalg.inv(before[:3, :3] + estimate.noise_m2)
         self.state = motion.state + gain @ (estimate.position_m - motion.state[:3])
@@ -84,7 +85,7 @@ class _Filter:
 
 @dataclass(frozen=True, slots=True)
 class _Last:
-    """Position of a track at its last estimate that was a position; before the first of these, at its last estimate."""
+    """Position of a track at its last estimate with a position; if there was none, at its last estimate."""
 
     time_ns: int
     position_m: FloatArray
@@ -102,7 +103,7 @@ class _Motion:
 
 @dataclass(frozen=True, slots=True)
 class _Measurement:
-    """An estimate with the covariance (3, 3) of its error, its confidence included, but not the error of the set-up."""
+    """An estimate with the covariance (3, 3) of its error, confidence included, without the error of the set-up."""
 
     time_ns: int
     position_m: FloatArray
@@ -120,21 +121,21 @@ class _Measurement:
 
 
 class Tracker:
-    """Follows sources: associate, update, start, end."""
+    """Follows sources: associates estimates with tracks, updates tracks, starts and ends them."""
 
     def __init__(self) -> None:
         self._filters: list[_Filter] = []
         self._next_id = 1
 
     def step(self, time_ns: int, estimates: Iterable[Estimate] = (), *, probable: bool = True) -> list[Track]:
-        """Take in the estimates of one moment, no two of one source; return the tracks that changed.
+        """Take in the estimates of one time, at most one for each source; return the tracks that changed.
 
         Parameters
         ----------
         time_ns : int
         estimates : iterable of Estimate
         probable : bool
-            Whether their confidence is the probability that they are right.
+            Whether the confidence of the estimates is the probability that they are right.
         """
         changed = self._end_silent(time_ns)
         followed = any(track.confirmed and time_ns - track.time_ns <= CONFIRM_S * 1e9 for track in self._filters)
@@ -156,7 +157,7 @@ class Tracker:
         return changed
 
     def _assigned(self, found: Sequence[_Measurement]) -> list[tuple[_Filter, _Motion] | None]:
-        """Assign to each estimate a track or None, no track twice: as many as possible, at the least total cost."""
+        """Assign a track or None to each estimate, no track twice: as many as possible, at the least total cost."""
         tracks = [*self._filters]
         if not tracks or not found:
             return [None] * len(found)
@@ -190,7 +191,7 @@ class Tracker:
 
 
 def _at_rest(position_m: FloatArray, covariance_m2: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the state and covariance of a source at rest that may set off at once, in any direction."""
+    """Return the state and covariance of a source at rest that may start at once in any direction."""
     covariance = np.zeros((6, 6))
     covariance[:3, :3] = covariance_m2
     covariance[3:, 3:] = START_SPEED_M_S**2 * np.eye(3)
@@ -208,7 +209,7 @@ def _moved(state: FloatArray, covariance: FloatArray, duration_ns: int) -> _Moti
 def _expected(track: _Filter, estimate: _Measurement) -> tuple[float, _Motion]:
     """Return the cost d^2 + ln det S of assigning an estimate to a track, and the track's motion.
 
-    The cost is infinite outside the gate, and where the estimate is only a direction and the track is not confirmed.
+    The cost is infinite outside the gate, and for an estimate that is only a direction if the track is not confirmed.
     """
     motion = track.predicted(estimate.time_ns)
     if not (track.confirmed or estimate.is_place):
@@ -222,7 +223,7 @@ def _expected(track: _Filter, estimate: _Measurement) -> tuple[float, _Motion]:
 
 
 def _off(motion: _Motion, estimate: _Measurement) -> tuple[float, float, float]:
-    """Return the distance of an estimate from a predicted position: in metres, d^2, and d^2 + ln det S."""
+    """Return the distance of an estimate from a predicted position in metres, d^2, and d^2 + ln det S."""
     difference = estimate.position_m - motion.state[:3]
     spread = motion.covariance[:3, :3] + estimate.noise_m2
     distance2 = float(difference @ np.linalg.solve(spread, difference))

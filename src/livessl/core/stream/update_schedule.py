@@ -1,4 +1,4 @@
-"""Which windows are located while a sound goes on: one every `update_frames`, or fewer when the server falls behind."""
+"""Decides which windows of a continuing sound are located: one every `update_frames`, or fewer under overload."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ class UpdateSchedule:
     Parameters
     ----------
     state : SiteState
-        Has the interval between two windows, and how many of them an overloaded server locates.
+        Contains the interval between two windows, and the share of them that an overloaded server locates.
     newest_only : bool
-        Of several windows that are due in one step, only the newest is located.
+        Whether only the newest window is located if several are due in one step.
     """
 
     def __init__(self, state: SiteState, *, newest_only: bool) -> None:

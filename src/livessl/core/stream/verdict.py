@@ -1,6 +1,6 @@
-"""Turns what an estimator found into results: status, reason, and what each array contributed. It keeps no state.
+"""Makes results from localizations: status, reason, and the contribution of each array. It keeps no state.
 
-`locate/confidence.py` decides the refusal by confidence.
+`locate/confidence.py` decides whether a position is refused because of its confidence.
 """
 
 from __future__ import annotations
@@ -39,26 +39,26 @@ RANGE_UNKNOWN: Final = 0.25
 reported."""
 
 RANGE_APERTURES: Final = 2.0
-"""Ratio of distance to aperture beyond which one array gives no distance: reverberation shifts its delays, which can
-move the position by metres along the line of sight and is not in the covariance."""
+"""Ratio of distance to aperture beyond which one array gives no distance: reverberation shifts its delays, which
+can move the position by metres along the line of sight. The covariance does not include this."""
 
 NO_SOUND: Final = "the server was overloaded and kept none of its sound"
 """Reason for which an event is refused if no array's samples are left."""
 
 
 def judged(found: Localization, specs: Sequence[ArraySpec]) -> tuple[Status, str | None]:
-    """Decide whether a location is a position, only a direction, or neither, and why.
+    """Decide whether a localization gives a position, only a direction, or neither, and why.
 
     Parameters
     ----------
     found : Localization
     specs : sequence of ArraySpec
-        The arrays that it was found by; none if no array carries evidence.
+        The arrays of the localization; empty if no array has evidence.
 
     Returns
     -------
     Status, str or None
-        The status, and the reason for it; None if there is nothing to add.
+        The status, and the reason for it; None without a reason.
     """
     if not specs:
         return Status.REFUSED, found.refused or NO_EVIDENCE
@@ -78,14 +78,14 @@ def judged(found: Localization, specs: Sequence[ArraySpec]) -> tuple[Status, str
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """The events of a sound, one for each source, and their localization; `found` is None if nothing was located."""
+    """The events of a sound, one for each source, and their localization `found`; None if nothing was located."""
 
     events: list[Event]
     found: Localization | None
 
 
 class Verdicts:
-    """Locates excerpts and judges what was found.
+    """Locates excerpts, and judges the localizations.
 
     Parameters
     ----------
@@ -108,11 +108,11 @@ class Verdicts:
         ----------
         event : PendingEvent
         excerpt : Excerpt
-            From the arrays that detected it.
+            Sound of the arrays that detected the event.
         now_ns : int
             Site time now.
         backfilled : mapping of array to BackfilledSound, optional
-            Sounds of other arrays that are used as well.
+            Sounds of further arrays, which did not detect the event.
         """
         backfilled = backfilled or {}
         received, least = excerpt.with_backfill(backfilled), self._state.parameters.min_arrays
@@ -151,7 +151,7 @@ class Verdicts:
         return Verdict([first, *others], found)
 
     def _received(self, found: Localization | None, excerpt: Excerpt, faulty: Iterable[str]) -> tuple[Received, ...]:
-        """Return what each array received, also those that were not used; nothing under overload."""
+        """Return the observations of all arrays, including those that were not used; none under overload."""
         estimator = self._state.estimator
         if self._state.relief.shed:
             return ()
@@ -163,7 +163,7 @@ class Verdicts:
         return tuple(receive(part, excerpt.sounds[part.spec.name].segments) for part in evidence)
 
     def _channel_faults(self, event: PendingEvent, excerpt: Excerpt) -> dict[str, str]:
-        """Return the faults, in words, of those arrays of an excerpt whose channels are faulty."""
+        """Return the faults, in words, of the arrays of an excerpt that have faulty channels."""
         examine, sounds = self._state.channel_faults.examine, excerpt.sounds
         faults = {name: examine(name, event.start, sound.onsets) for name, sound in sounds.items()}
         return {name: fault for name, fault in faults.items() if fault is not None}
@@ -185,7 +185,7 @@ class Verdicts:
         )
 
     def locate_window(self, event: PendingEvent, excerpt: Excerpt) -> tuple[Update, Localization]:
-        """Locate a window of an event that goes on; return the update, and the location that it was made from."""
+        """Locate a window of an event that continues; return the update and its localization."""
         found = self._located(excerpt)
         estimate = self._estimate(found, excerpt)
         status, _ = self._judged(estimate, found)
@@ -200,17 +200,17 @@ class Verdicts:
         ), found
 
     def count_votes(self, event: PendingEvent, excerpt: Excerpt, verdict: Verdict) -> None:
-        """Count which of the arrays that detected an event were outliers, unless it was refused."""
+        """Count which of the arrays that detected an event were outliers, unless the event was refused."""
         if verdict.found is not None and verdict.events[0].status is not Status.REFUSED:
             self._state.votes.count(event.start, verdict.found, excerpt.sounds)
 
     def _others(self, found: Localization, excerpt: Excerpt) -> list[tuple[Localization, Estimate]]:
-        """Return those further sources of the same sound that are positions, and their estimates."""
+        """Return the further sources of the sound that have a position, and their estimates."""
         others = [(other, self._estimate(other, excerpt)) for other in found.others]
         return [(other, place) for other, place in others if self._judged(place, other)[0] is Status.LOCATED]
 
     def _located(self, excerpt: Excerpt) -> Localization:
-        """Locate, and refuse an answer of numbers that are none, as methods of others may give."""
+        """Locate an excerpt, and refuse results that contain NaN or infinity, which added methods may return."""
         estimator = self._state.estimator
         found = estimator.locate(excerpt.sounds)
         if np.isfinite(found.position_m).all() and np.isfinite(found.covariance_m2).all():
@@ -279,7 +279,7 @@ def _used(found: Localization, arrays: Iterable[str]) -> tuple[str, ...]:
 
 
 def _distance_m(spec: ArraySpec, position_m: FloatArray) -> float:
-    """Return the distance of a position from an array, at least half the aperture: a position may lie inside it."""
+    """Return the distance of a position from an array; at least half the aperture, because it may lie in the array."""
     return max(direction_deg(spec.centre_m, position_m)[2], spec.aperture_m / 2.0)
 
 
@@ -319,7 +319,7 @@ def _dissent(found: Localization) -> str | None:
 
 
 def _limit_of_set_up(estimate: Estimate) -> str | None:
-    """Return a reason that gives the error of the set-up; None if it allows a position to be right to `NEAR_M`."""
+    """Return a reason that names the error of the set-up; None if positions can be right to `NEAR_M` despite it."""
     off_m = half_axis_m(estimate.set_up_covariance_m2)
     if off_m <= NEAR_M:
         return None
