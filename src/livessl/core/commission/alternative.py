@@ -1,4 +1,4 @@
-"""A set-up other than the one that is filed, and how large a difference must be to be reported."""
+"""Describes a set-up that differs from the filed one, and defines how large a difference must be to be reported."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 LEAST_TURN_DEG: Final = 3.0
-"""Smallest turn, in degrees, that is reported."""
+"""Smallest rotation, in degrees, that is reported."""
 
 LEAST_SHIFT_M: Final = 0.1
 """Smallest shift, in metres, that is reported."""
@@ -20,12 +20,12 @@ LEAST_LATE_S: Final = 40e-6
 """Smallest delay of a single channel, in seconds, that is reported: two samples at 48 kHz."""
 
 LEAST_SPEED_M_S: Final = 6.0
-"""Smallest error of the speed of sound, in m/s, that is reported: some 10 degrees of temperature."""
+"""Smallest error of the speed of sound, in m/s, that is reported: about 10 degrees of temperature."""
 
 
 @dataclass(frozen=True, slots=True)
 class Alternative:
-    """A set-up other than the one that is filed.
+    """A set-up that differs from the filed one.
 
     Parameters
     ----------
@@ -33,25 +33,25 @@ class Alternative:
         Code of the fault: swapped, mirrored, exchanged, turned, moved, height, late_channel, geometry,
         temperature.
     array : str or None
-        The array that is other than filed; None for the whole site.
+        The array that differs from the filed set-up; None for the whole site.
     other : str or None
-        The array that it is exchanged with.
+        The array with which `array` is exchanged.
     channel : int or None
-        The channel, from 1, that is late or whose microphone is elsewhere.
+        The channel, counted from 1, that is late or whose microphone is at another place.
     misfit_s : float
-        Misfit of the sounds with it, seconds.
+        Misfit of the sounds with this set-up, seconds.
     criterion : float
         Bayesian information criterion; the lowest is best.
     order : tuple of int
         For each microphone of the site file, the channel from 1 that carries it; empty if channels are as filed.
     turn_deg, shift_m : (3,) tuple of float
-        Turn of the array about its centre (a vector along the axis), and its shift or that of the microphone.
+        Rotation of the array about its centre (a vector along the axis), and shift of the array or the microphone.
     late_s : float
         Delay of the channel, seconds.
     speed_m_s : float or None
-        Speed of sound, if it is what differs.
+        Speed of sound, m/s, if it differs.
     speed_off_m_s : float
-        Its difference from the filed one, m/s.
+        Difference from the filed speed of sound, m/s.
     """
 
     fault: str
@@ -69,12 +69,12 @@ class Alternative:
 
     @property
     def concerns(self) -> tuple[str | None, str | None, int | None]:
-        """The arrays and the channel that it is about: alternatives of the same ones are no rivals of each other."""
+        """The arrays and the channel that differ; alternatives about the same ones do not compete with each other."""
         return self.array, self.other, self.channel
 
     @property
     def is_large(self) -> bool:
-        """True if it differs from what is filed by more than a careful set-up may."""
+        """True if the difference is larger than in a careful set-up."""
         if self.fault == "turned":
             return float(np.linalg.norm(self.turn_deg)) >= LEAST_TURN_DEG
         if self.fault in ("moved", "height", "geometry"):

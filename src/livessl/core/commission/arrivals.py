@@ -1,4 +1,4 @@
-"""Times at which arrays that share a clock received the same sounds: they determine distances; directions do not."""
+"""Times at which arrays that share a clock received the same sounds. They determine distances, unlike directions."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ class Arrivals:
     arrays : tuple of str
         Arrays on one clock.
     times_s : (S, A) float64
-        Mean time over the microphones of each array, seconds, up to a constant for each sound; NaN where an array did
-        not receive it.
+        Mean time over the microphones of each array, seconds, up to a constant for each sound; NaN if an array did not
+        receive the sound.
     std_s : float
         Standard deviation of a difference of two times, seconds.
     """
@@ -44,7 +44,7 @@ class Arrivals:
         return centred(np.where(there, predicted, np.nan)) - centred(self.times_s)
 
     def slopes_s_m(self, microphones: Microphones, positions_m: FloatArray, c_m_s: float) -> FloatArray:
-        """Slope (S, A, 3) of `contradictions_s` by the places, seconds per metre."""
+        """Return the slope (S, A, 3) of `contradictions_s` by the places, seconds per metre."""
         slopes = []
         for name in self.arrays:
             towards = positions_m[:, None] - microphones[name]
@@ -57,7 +57,7 @@ class Arrivals:
 
 
 def mean_times_s(arrays_m: list[FloatArray], positions_m: FloatArray, c_m_s: float) -> FloatArray:
-    """Mean travel times (S, A) from places (S, 3) to the microphones of each array, seconds."""
+    """Return the mean travel times (S, A) from places (S, 3) to the microphones of each array, seconds."""
     return (
         np.stack([np.linalg.norm(positions_m[:, None] - at_m, axis=2).mean(axis=1) for at_m in arrays_m], axis=1)
         / c_m_s

@@ -1,4 +1,4 @@
-"""A fault of a pose that some sounds could not have shown, as a value."""
+"""Describes a blind spot: a fault of a pose that the sounds so far could not reveal."""
 
 from __future__ import annotations
 
@@ -6,31 +6,32 @@ from dataclasses import dataclass
 from typing import Final
 
 CURE: Final = "clap at places that you know, and run livessl calibrate verify"
-"""Action that shows a fault which sounds at unknown places hide."""
+"""Action that reveals a fault which sounds at unknown places hide."""
 
 MOST_SHIFT_M: Final = 1000.0
-"""Least visible shift, in metres, beyond which its size is not reported: practically no shift would show."""
+"""Least visible shift, in metres, from which its size is not reported, because practically no shift would be
+visible."""
 
 MOST_TURN_DEG: Final = 180.0
-"""Least visible turn, in degrees, beyond which its size is not reported: no turn would show."""
+"""Least visible rotation, in degrees, from which its size is not reported, because no rotation would be visible."""
 
 
 @dataclass(frozen=True, slots=True)
 class BlindSpot:
-    """A fault of a pose that some sounds would not show.
+    """A fault of a pose that some sounds would not reveal.
 
     Parameters
     ----------
     fault : str
         `moved`, `turned` or `mirrored`.
     arrays : tuple of str
-        The array; several if the same fault of each of them would be hidden alike, and of a mirrored room those whose
+        The array; several if the same fault would be hidden for each of them. For a mirrored room, the arrays whose
         channels would be exchanged.
     least : float
-        Smallest shift, in metres, or turn, in degrees, that the sounds would show in nine of ten cases. Of a mirrored
-        room the turn, in degrees, that some array would have besides exchanged channels.
+        Smallest shift, in metres, or rotation, in degrees, that the sounds would reveal in nine of ten cases. For a
+        mirrored room, the largest rotation, in degrees, of an array in addition to exchanged channels.
     along : (3,) tuple of float
-        Unit vector of the shift, of the axis of the turn, or at right angles to the plane of the mirror.
+        Unit vector of the shift, of the axis of rotation, or at right angles to the plane of the mirror.
     """
 
     fault: str
@@ -40,7 +41,7 @@ class BlindSpot:
 
     @property
     def message(self) -> str:
-        """One sentence, without a full stop, that says what the sounds cannot show."""
+        """One sentence, without a full stop, that describes the fault that the sounds cannot reveal."""
         names = " or ".join(repr(name) for name in self.arrays)
         along = ", ".join(f"{x:.2f}" for x in self.along)
         if self.fault == "mirrored":

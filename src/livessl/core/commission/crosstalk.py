@@ -1,10 +1,10 @@
-"""Finds crosstalk: channels that receive each other's sound through the interface or the cable, without delay.
+"""Finds crosstalk: channels that receive each other's signal through the interface or the cable, without delay.
 
-Through the air a sound reaches two microphones with a delay that depends on where it is. Through the interface it
-arrives at once, from whatever place, and the noise of the other channel does as well. The phases between two channels,
-all bins of the spectrum alike, therefore have a common part at delay 0 that remains when many windows are combined.
-Something steady in the middle between two microphones, such as a fan, looks the same in pauses, but not while there are
-sounds: the common part must be there with sounds as well.
+Through the air, a sound reaches two microphones with a delay that depends on its place. Through the interface, the
+sound and the noise of the other channel arrive without delay. The phases between two channels, in all bins of the
+spectrum, therefore have a common part at delay 0 that remains when many windows are combined. A fan in the middle
+between two microphones has the same effect in pauses, but not during sounds. The common part must therefore be present
+during sounds as well.
 """
 
 from __future__ import annotations
@@ -21,25 +21,27 @@ from livessl.core.commission.finding import Finding, Severity
 from livessl.core.types import ComplexArray, Float32Array, FloatArray
 
 WINDOW_S: Final = 0.5
-"""Length of a window, seconds: long against reverberation and delays, so that each bin has phases of its own."""
+"""Length of a window, seconds: long compared with reverberation and delays, so that the phases of bins are
+independent."""
 
 MOST_WINDOWS: Final = 240
-"""Windows, the last ones, that are combined."""
+"""Number of latest windows that are combined."""
 
 LEAST_WINDOWS: Final = 6
-"""Fewest windows with sound from which anything is concluded."""
+"""Fewest windows with sound from which crosstalk is judged."""
 
 LOUD: Final = 10.0
-"""Power of a window with sound relative to the quietest fifth of windows."""
+"""Least power of a window with sound, relative to the quietest fifth of windows."""
 
 WITH_SOUND: Final = 0.5
-"""Least common part in windows with sound, relative to that in all windows."""
+"""Least common part in windows with sound, relative to the common part in all windows."""
 
 LEAST_LAG: Final = 6
 """Smallest delay, in samples, between two microphones that are compared: with less, delay 0 does not stand out."""
 
 MOST_PAIRS: Final = 28
-"""Most pairs of channels that are compared, those of eight channels; of more channels each with the next one."""
+"""Largest number of pairs of channels that are compared: those of eight channels. With more channels, each is compared
+with the next one."""
 
 LEAST_SHARE: Final = 0.03
 """Least common part that is reported: crosstalk of about -28 dB."""
@@ -51,18 +53,18 @@ STANDING: Final = 5.0
 """Least ratio of the common part at delay 0 to the median at other delays; random phases exceed 4.5 once in 10^6."""
 
 _BESIDE: Final = 2
-"""Delay, in samples, from which the common part does not reach."""
+"""Delay, in samples, from which the common part at delay 0 has no influence."""
 
 _NEAR: Final = 5
 """Delay, in samples, up to which the sound field itself is the same as at delay 0."""
 
 _SHARE_OF_LEVEL: Final = np.pi / 4.0
-"""Common part for a level of crosstalk of 1, to first order, where bins of both channels are independent and Gaussian
+"""Common part for a level of crosstalk of 1, to first order, if the bins of both channels are independent and Gaussian
 with equal power: half the mean of the inverse ratio of their magnitudes, which is pi/2."""
 
 
 class CrosstalkMeter:
-    """Accumulates what the samples of one array say about crosstalk between its channels.
+    """Measures crosstalk between the channels of one array from its samples.
 
     Parameters
     ----------
@@ -117,7 +119,7 @@ class CrosstalkMeter:
         return found
 
     def faults(self, array: str) -> Iterator[Finding]:
-        """Yield a warning for each channel with crosstalk; for both of a pair, where neither is in all pairs."""
+        """Yield a warning for each channel with crosstalk; for both of a pair if neither is in all pairs."""
         shares = self.shares()
         common = set.intersection(*(set(pair) for pair in shares)) if len(shares) > 1 else set()
         for index in sorted(common or {index for pair in shares for index in pair}):
@@ -136,7 +138,7 @@ class CrosstalkMeter:
             )
 
     def _take(self, window: Float32Array) -> None:
-        """Keep a window's power, and the mean of its phases between the channels at the delays that are looked at."""
+        """Keep the power of a window, and its mean phases between the channels at the examined delays."""
         spectra = scipy.fft.rfft(np.diff(window, axis=1), axis=1)[:, 1:]
         magnitudes = np.abs(spectra)
         unit = np.divide(spectra, magnitudes, out=np.zeros_like(spectra), where=magnitudes > 0.0)

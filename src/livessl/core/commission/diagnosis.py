@@ -1,10 +1,10 @@
-"""Finds what explains the contradictions between the delays of sounds: other orders of channels, other poses.
+"""Chooses the alternative set-up that explains contradictions between delays, such as swapped channels or other poses.
 
-With the set-up as filed, the arrays' delays of a sound fit no place if something is wrong. Each alternative is tried:
-every order of an array's channels, turns and shifts of an array, another speed of sound. The one that explains the
-sounds best is named, provided that it explains them far better than the set-up as filed, and better than every
-alternative of another array. Sounds at unknown places are judged with the freedom of a careful set-up
-(`livessl.core.commission.judge`), those at measured places by their misfits (`livessl.core.commission.trial`).
+If the filed set-up is wrong, the arrays' delays of a sound fit no place. These alternatives are compared: every order
+of an array's channels, rotations and shifts of an array, and another speed of sound. The alternative that explains the
+sounds best is chosen if it explains them far better than the filed set-up, and better than every alternative of another
+array. Sounds at unknown places are judged with the freedom of a careful set-up (`livessl.core.commission.judge`), those
+at measured places by their misfits (`livessl.core.commission.trial`).
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ MIN_LEAD_OF_GAIN: Final = 0.06
 what the best one gains. If both explain much, the errors of the delays may be what distinguishes them."""
 
 EQUAL: Final = 0.5
-"""Share of `MIN_LEAD` within which alternatives explain the sounds equally well; if the gain is large,
-`MIN_LEAD_OF_GAIN` of it is used instead."""
+"""Share of the required lead (`MIN_LEAD`, or `MIN_LEAD_OF_GAIN` of a large gain) within which alternatives count as
+explaining the sounds equally well."""
 
 KNOWN_MIN_GAIN: Final = 12.0
 KNOWN_MIN_LEAD: Final = 6.0
@@ -39,15 +39,16 @@ KNOWN_MIN_LEAD: Final = 6.0
 places; both in the Bayesian information criterion."""
 
 FLOOR_S: Final = 12e-6
-"""Misfit, in seconds, that remains in a set-up that is filed as well as one can measure it: microphones to 2 mm, arrays
-to 2 cm and 1.5 degrees."""
+"""Misfit, in seconds, that remains in a carefully measured set-up, with microphones to 2 mm and arrays to 2 cm and 1.5
+degrees."""
 
 MOST_SOUNDS: Final = 24
-"""Most sounds that are compared: more of them show little more, because the errors of the set-up do not average out."""
+"""Largest number of sounds that are used. More sounds add little, because the errors of the set-up do not average
+out."""
 
 MOST_ARRAYS: Final = 8
-"""Most arrays that are judged together. The time of each fit grows with the cube of their number, its memory with the
-square, and there are more alternatives to fit."""
+"""Largest number of arrays that are judged together. The time of each fit grows with the cube of this number, the
+memory with the square, and the number of alternatives grows as well."""
 
 MIN_RATIO: Final = 1.3
 """Least ratio between the misfit as filed and that of the alternative."""
@@ -64,18 +65,18 @@ class Diagnosis:
     misfit_s : float
         Misfit with the set-up as filed, seconds.
     best : Alternative or None
-        The alternative to believe; None if the set-up as filed is as good, or no alternative stands out.
+        The chosen alternative; None if the set-up as filed is as good, or no alternative stands out.
     rivals : tuple of Alternative
-        All that were refined, best first.
+        All alternatives that were refined, best first.
     contradicts : bool
-        Whether the sounds contradict the set-up as filed, explained or not.
+        Whether the sounds contradict the set-up as filed, with or without an explanation.
     lead : float
         Lead of the best alternative over the set-up as filed and over alternatives of other arrays, in the criterion.
     gained : float
         Lead of the first rival over the set-up as filed.
     undecided : tuple of Alternative
-        Two or more that are the same fault of different arrays and explain the sounds equally well, best first: one of
-        them is true.
+        Two or more alternatives with the same fault of different arrays that explain the sounds equally well, best
+        first. One of them is true.
     """
 
     sounds: int
@@ -126,7 +127,7 @@ def diagnose(
 def verify(microphones: Microphones, delays: Delays, places_m: FloatArray, c_m_s: float) -> Diagnosis:
     """Compare the set-up as filed with its alternatives, by sounds at measured places.
 
-    One array is enough, and one sound shows whether something is wrong; three or four show what.
+    One array is enough. One sound shows whether something is wrong, and three or four sounds show what is wrong.
 
     Parameters
     ----------
@@ -155,8 +156,8 @@ def of_sounds(delays: Delays, rows: IntArray) -> dict[str, FloatArray]:
 def most_doubtful(microphones: Microphones, delays: Delays, search: PlaceSearch) -> list[str]:
     """Return the names of the `MOST_ARRAYS` arrays that are judged together, in the order of the site.
 
-    Half of them are those that disagree most with the places that all arrays say. The others received the sounds of
-    these best: what is wrong with an array shows only against others.
+    Half of them disagree most with the places that all arrays together give. The others received the sounds of these
+    arrays best, because a fault of an array is visible only in comparison with other arrays.
     """
     places_m = search.fit(microphones, delays).positions_m
     off_s = {}
@@ -175,7 +176,7 @@ def most_doubtful(microphones: Microphones, delays: Delays, search: PlaceSearch)
 
 
 def _by_criterion(trial: Trial) -> Diagnosis:
-    """Compare alternatives by their misfits alone, as sounds at known places allow."""
+    """Compare alternatives by their misfits alone, which is enough for sounds at known places."""
     filed_s = trial.filed.misfit_s
     if filed_s <= MIN_RATIO * KNOWN_FLOOR_S:
         return Diagnosis(trial.sounds, filed_s, None, (), contradicts=False)
@@ -194,7 +195,7 @@ def _by_criterion(trial: Trial) -> Diagnosis:
 
 
 def _by_judge(judge: Judge, arrays: int) -> Diagnosis:
-    """Compare alternatives with the freedom of a careful set-up; the judged arrays were chosen from so many."""
+    """Compare alternatives with the freedom of a careful set-up; `arrays` is the number of all arrays."""
     least = least_gain(arrays)
     misfit_s = judge.misfit_s
     if misfit_s <= MIN_RATIO * FLOOR_S and not judge.may_gain(least):
@@ -217,7 +218,7 @@ def _decided(
     least_lead: float,
     apart: float,
 ) -> Diagnosis:
-    """Name the best alternative if it leads by so much, or those that are not further apart."""
+    """Choose the best alternative if its lead is large enough, or those that explain the sounds equally well."""
     best = rivals[0]
     others = [one for one in rivals if one.concerns != best.concerns]
     lead = others[0].criterion - best.criterion if others else gained

@@ -1,4 +1,4 @@
-"""A fault of a set-up, as a value."""
+"""Describes a fault of a set-up: its place, its words, and its cure."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from enum import StrEnum
 from typing import Final
 
 LEAST_SOUNDS: Final = 3
-"""Fewest sounds from which anything is concluded."""
+"""Fewest sounds from which delays are judged."""
 
 OF_SET_UP: Final = frozenset(
     {"swapped", "mirrored", "exchanged", "turned", "moved", "late_channel", "geometry", "temperature"}
 )
-"""Codes of what the delays of all sounds show together."""
+"""Codes of the faults that only the delays of all sounds together reveal."""
 
 
 class Severity(StrEnum):
@@ -40,11 +40,11 @@ class Finding:
     confidence : float
         0 to 1.
     message : str
-        What is wrong, in one sentence without a full stop.
+        The fault, in one sentence without a full stop.
     cure : str
-        What to do.
+        The action that corrects the fault.
     input : int or None
-        Input of the device that carries the channel, from 1, where the site file says so.
+        Input of the device that carries the channel, from 1; None if the site file does not name it.
     """
 
     fault: str

@@ -1,4 +1,4 @@
-"""Turns what arrays observed of some sounds into findings: what is wrong, where, how sure, and what cures it."""
+"""Makes findings from the observations of sounds: what is wrong, where, with which confidence, and the cure."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from livessl.core.commission.set_up import DELAY_STD_S, Freedom, Known, careful
 from livessl.core.types import BoolArray, FloatArray, Observation
 
 EXACT_S: Final = 2e-6
-"""Standard deviation, in seconds, of a delay whose pairs agree perfectly: converters and microphones differ by as
-much."""
+"""Standard deviation, in seconds, of a delay whose pairs agree perfectly, because converters and microphones differ by
+that much."""
 
 MOST_SHARE: Final = 0.6
-"""Share of the sounds in which a channel must show a fault."""
+"""Least share of the sounds in which a channel must have a fault for the fault to be reported."""
 
 DEAF_COHERENCE: Final = 0.35
 """Coherence, relative to the array's clearest channels, below which a channel did not receive the sound."""
@@ -39,7 +39,8 @@ SAME_SIGNAL_S: Final = 2e-6
 """Delay, in seconds, that two channels with the same signal never exceed."""
 
 APART_M: Final = 0.02
-"""Distance between microphones, in metres, from which sounds from different directions differ by more than that."""
+"""Distance between microphones, in metres, from which sounds from different directions differ by more than
+`SAME_SIGNAL_S`."""
 
 SILENT: Final = 1e-9
 """Power relative to the array's median below which a channel is dead: converters leave more noise."""
@@ -57,15 +58,15 @@ def find_faults(
     Parameters
     ----------
     microphones : mapping of array to (K, 3) float64
-        As the site file has them, metres.
+        Positions in the site file, metres.
     sounds : sequence of sequences of Observation
-        What the arrays observed of each sound.
+        Observations of the arrays for each sound.
     bounds_m : (3, 2) float64
         Search volume, metres.
     c_m_s : float
-        Speed of sound as the site file has it, m/s.
+        Speed of sound in the site file, m/s.
     freedom : mapping of array to Freedom, or None
-        How exactly the set-up is known; None for a careful one.
+        Standard deviations of the set-up; None for a careful set-up.
     """
     findings = channel_findings(microphones, sounds)
     joint = [sound for sound in sounds if len(sound) > 1]
@@ -89,9 +90,9 @@ def channel_findings(microphones: Microphones, sounds: Sequence[Sequence[Observa
 def sharp_delays(
     microphones: Microphones, sounds: Sequence[Sequence[Observation]], findings: Sequence[Finding]
 ) -> dict[str, FloatArray]:
-    """Delays (S, K) of each array that clearly received any of the sounds, seconds.
+    """Return the delays (S, K), seconds, of each array that clearly received any of the sounds.
 
-    They are NaN where an array did not clearly receive a sound, and for channels that carry none of their own.
+    Delays are NaN if an array did not clearly receive a sound, and for channels without their own signal.
     """
     unusable = {array: np.zeros(len(at_m), dtype=bool) for array, at_m in microphones.items()}
     for finding in findings:
@@ -102,9 +103,9 @@ def sharp_delays(
 
 
 def stds_s(delays: Delays, sounds: Sequence[Sequence[Observation]]) -> dict[str, FloatArray]:
-    """Return how exact the delays of each array are, (S,) seconds: about as exact as its pairs agree with each other.
+    """Return the standard deviation (S,), seconds, of each array's delays, estimated from how well its pairs agree.
 
-    Two channels are one pair, which agrees with itself however wrong it is.
+    Two channels have only one pair, whose error cannot be estimated in this way.
     """
     found = {name: np.full(len(sounds), DELAY_STD_S) for name in delays}
     for row, sound in enumerate(sounds):
@@ -189,7 +190,7 @@ def _channel_fault(fault: str, array: str, index: int, share: float, message: st
 
 
 def _copies(at_m: FloatArray, observed: Sequence[Observation]) -> dict[int, tuple[int, float]]:
-    """Channels that carry the signal of another, with that channel and the share of sounds in which they do."""
+    """Return the channels that carry the signal of another one, with that channel and the share of such sounds."""
     delays_s = np.array([one.delays_s for one in observed])
     found = {}
     for k in range(1, len(at_m)):
@@ -204,7 +205,7 @@ def _copies(at_m: FloatArray, observed: Sequence[Observation]) -> dict[int, tupl
 
 
 def set_up_findings(diagnosis: Diagnosis) -> Iterator[Finding]:
-    """Yield what the delays say about the order of channels, the poses and the speed of sound."""
+    """Yield the findings about the order of channels, the poses and the speed of sound."""
     misfit_us = 1e6 * diagnosis.misfit_s
     if diagnosis.best is not None:
         what, cure = _words(diagnosis.best)

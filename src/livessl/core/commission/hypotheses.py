@@ -1,7 +1,7 @@
-"""Set-ups other than the one that is filed, each with the places of the sounds where its fit begins.
+"""Lists alternatives to the filed set-up, such as swapped channels, with places of the sounds at which fits begin.
 
-What is far from the filed set-up (another order of channels, an exchange, a large turn) is ranked on a grid of places
-first, which costs little, and only the best of it is fitted.
+Alternatives that are far from the filed set-up (another order of channels, exchanged arrays, a large rotation) are
+first ranked on a grid of places, which takes little time. Only the best of them are fitted.
 """
 
 from __future__ import annotations
@@ -21,29 +21,31 @@ from livessl.core.commission.set_up import Freedom, Known, SetUp
 from livessl.core.types import Float32Array, FloatArray, IntArray
 
 ALL_ORDERS: Final = 4
-"""Most microphones of an array of which all orders are tried; of larger arrays exchanges of two, shifts and mirror."""
+"""Largest number of microphones of an array for which all orders are tried. For larger arrays, exchanges of two
+channels, shifts and the mirrored order are tried."""
 
 FITTED_ORDERS: Final = 6
-"""Number of orders of channels, the best at first sight, that are fitted."""
+"""Number of orders of channels, the best ones on the grid, that are fitted."""
 
 MIN_FOR_ONE: Final = 4
-"""Fewest microphones of an array of which a single one is examined: the others must say what it ought to receive."""
+"""Fewest microphones of an array in which single ones are examined, because the others must predict the delays of
+one."""
 
 YAWS_DEG: Final = tuple(np.arange(-180.0, 180.0, 20.0).tolist())
-"""Turns about the vertical, in degrees, that are tried on the grid, the right way up and upside down."""
+"""Rotations about the vertical, in degrees, that are tried on the grid, the right way up and upside down."""
 
 UPRIGHT_COST: Final = 2.0
-"""Deviance that a turn about the vertical alone must gain: it has one unknown, and is what people get wrong."""
+"""Deviance that a rotation about the vertical alone must gain. It has one unknown, and is the most common error."""
 
 FREER_COST: Final = 8.0
-"""Deviance that a set-up must gain if the pose or all microphones of an array are free in it: as much as a fault of
-three unknowns must. The faults of one unknown that it covers gain more where they are reported."""
+"""Deviance that a set-up must gain in which the pose or all microphones of an array are free: as much as a fault with
+three unknowns. Faults with one unknown, which such a set-up includes, gain more if they are reported."""
 
 FREE_M: Final = 1.0
 FREE_DEG: Final = 60.0
 FREE_MICROPHONE_M: Final = 0.1
 FREE_SPEED_M_S: Final = 20.0
-"""Standard deviations of what a hypothesis leaves free: metres, degrees, metres, m/s."""
+"""Standard deviations of the quantities that a hypothesis leaves free: metres, degrees, metres, m/s."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,15 +55,15 @@ class Hypothesis:
     Parameters
     ----------
     alternative : Alternative or None
-        What differs from the filed set-up; what is left free has its value where the fit begins. None for the filed
+        Difference from the filed set-up; a free quantity has the value at which the fit begins. None for the filed
         set-up itself.
     set_up : SetUp
     starts_m : (S, 3) float64
-        Places of the sounds to begin at, metres.
+        Places of the sounds at which the fit begins, metres.
     but : (str, int) or None
-        Array and index of a channel that these places are found without.
+        Array and index of a channel that is not used to find these places; None if all are used.
     cost : float or None
-        What it must gain, where that is not what alternatives of its fault must gain.
+        Deviance that the hypothesis must gain; None for the usual cost of its fault.
     """
 
     alternative: Alternative | None
@@ -97,11 +99,11 @@ class Hypotheses:
         return Hypothesis(None, self._filed, self._starts_m)
 
     def freer(self, places_m: FloatArray) -> list[Hypothesis]:
-        """Return set-ups that are at least as free as any that is nearly as filed, with what they must gain.
+        """Return set-ups with more freedom than any alternative near the filed one, and the gain that each needs.
 
-        The pose, and then the microphones, of one array after the other are left free together, and the speed of sound;
-        then its turn about the vertical alone, which must gain less. They say how much there is to gain. `places_m`
-        (S, 3) are those of the filed set-up.
+        For each array, its pose, then its microphones are left free, and the speed of sound is left free. Then only its
+        rotation about the vertical is left free, which must gain less. The fits show how much can be gained at most.
+        `places_m` (S, 3) are the places in the filed set-up.
         """
         freer = []
         for name, own in self._freedom.items():
@@ -115,7 +117,7 @@ class Hypotheses:
         return freer
 
     def near(self, places_m: FloatArray) -> Iterator[Hypothesis]:
-        """Yield the alternatives that are fitted from the filed set-up and its places (S, 3), metres."""
+        """Yield the alternatives whose fit begins at the filed set-up and its places (S, 3), metres."""
         for name, own in self._freedom.items():
             upright = self._with(name, _upright(own))
             yield Hypothesis(_alternative("turned", name), upright, places_m, cost=UPRIGHT_COST)
@@ -138,7 +140,7 @@ class Hypotheses:
         yield Hypothesis(replace(_alternative("temperature"), speed_m_s=self._search.c_m_s), faster, places_m)
 
     def far(self) -> Iterator[Hypothesis]:
-        """Yield the alternatives that begin at places of their own: orders of channels, exchanges and large turns."""
+        """Yield the alternatives whose fit begins elsewhere: orders of channels, exchanges and large rotations."""
         yield from self._best_orders()
         for one, other in combinations(self._delays, 2):
             if self._delays[one].shape[1] == self._delays[other].shape[1]:
@@ -194,7 +196,7 @@ class Hypotheses:
         return Hypothesis(alternative, replace(self._filed, delays=delays, stds_s=stds_s), self._at_lowest(costs))
 
     def _best_turn(self, name: str) -> Hypothesis | None:
-        """Return the array turned as the grid says best; None if that is as filed."""
+        """Return the best rotation of the array on the grid; None if it is the filed orientation."""
         at_m, others = self._microphones[name], self._all_but(name)
         centre_m = at_m.mean(axis=0)
         turns = Rotation.from_euler("ZX", list(product(YAWS_DEG, (0.0, 180.0))), degrees=True)
@@ -214,7 +216,7 @@ class Hypotheses:
         return replace(self._filed, freedom=self._freedom | {name: freedom})
 
     def _all_but(self, *left_out: str) -> Float32Array:
-        """Sum of the costs (S, G) of the other arrays."""
+        """Return the sum of the costs (S, G) of the other arrays."""
         first = next(iter(self._costs.values()))
         kept = (costs for name, costs in self._costs.items() if name not in left_out)
         return np.asarray(sum(kept, np.zeros_like(first)))
@@ -224,7 +226,7 @@ class Hypotheses:
 
 
 def _upright(own: Freedom) -> Freedom:
-    """Return the freedom of an array that may be turned about the vertical."""
+    """Return the freedom of an array that may be rotated about the vertical."""
     return replace(own, orientation_deg=np.array([*own.orientation_deg[:2], FREE_DEG]))
 
 
@@ -233,9 +235,9 @@ def _alternative(fault: str, array: str | None = None, channel: int | None = Non
 
 
 def _costs(tables_s: Float32Array, delays_s: FloatArray) -> Float32Array:
-    """Squared contradictions of delays (S, K) at one array with the grid points of tables (T, K, G), (T, S, G).
+    """Return the squared contradictions (T, S, G) of delays (S, K) at one array with tables (T, K, G) of grid points.
 
-    Single precision resolves contradictions of a microsecond, and those of a wrong order are a hundred.
+    Single precision resolves contradictions of one microsecond; a wrong order has a hundred microseconds.
     """
     there = np.isfinite(delays_s)
     costs = np.zeros((len(tables_s), len(delays_s), tables_s.shape[2]), dtype=np.float32)
@@ -254,14 +256,14 @@ def _costs(tables_s: Float32Array, delays_s: FloatArray) -> Float32Array:
 
 
 def _costs_in_orders(tables_s: Float32Array, delays_s: FloatArray, orders: Sequence[IntArray]) -> Float32Array:
-    """Costs (n, S, G) of delays (S, K) in n orders."""
+    """Return the costs (n, S, G) of delays (S, K) in n orders."""
     ordered = np.stack([delays_s[:, order] for order in orders])
     costs = _costs(tables_s, ordered.reshape(-1, delays_s.shape[1]))
     return costs.reshape(len(orders), len(delays_s), -1)
 
 
 def channel_orders(count: int) -> list[IntArray]:
-    """Orders of channels to try: `order[i]` is the channel that carries microphone i."""
+    """Return the orders of channels to try; `order[i]` is the channel that carries microphone i."""
     same = tuple(range(count))
     if count <= ALL_ORDERS:
         return [np.array(order) for order in permutations(same) if order != same]

@@ -1,7 +1,7 @@
-"""Judges alternative set-ups by how well they explain sounds with the small freedom that every set-up has.
+"""Compares alternatives to the filed set-up, such as swapped channels, by how well they explain the delays of sounds.
 
-The set-ups are fitted together. Other orders of channels and large turns are many: `hypotheses` ranks them at the
-points of a grid, and only the best of them are fitted.
+Every set-up has the same small freedom, and all of them are fitted together. There are many orders of channels and
+large rotations: `hypotheses` ranks them at the points of a grid, and only the best of them are fitted.
 """
 
 from __future__ import annotations
@@ -31,35 +31,35 @@ COSTS: Final = {
     "temperature": 2.0,
 }
 """Deviance that an alternative must gain to be as good as the set-up as filed: two for each unknown (Akaike), one for
-each channel in another order. A shift, and a turn about any axis, cost two more than their three unknowns, because the
-turn about the vertical alone (`UPRIGHT_COST`) is what people get wrong most often. A displaced microphone costs two
-more, because there are many microphones."""
+each channel in another order. A shift, and a rotation about any axis, cost two more than their three unknowns, because
+the rotation about the vertical alone (`UPRIGHT_COST`) is the most common error. A displaced microphone costs two more,
+because there are many microphones."""
 
 MOST_SLOPES: Final = 500_000
-"""Most slopes (set-ups by sounds by channels by unknowns) of one array that are computed at one time: 4 MB."""
+"""Largest number of slopes (set-ups by sounds by channels by unknowns) of one array computed at one time: 4 MB."""
 
 MOST_NORMAL: Final = 8_000_000
-"""Most numbers in the normal equations of the set-ups that are fitted at one time: 64 MB. The unknowns of a set-up are
-those of all its arrays, so the equations of one with 30 arrays have 300 000 numbers."""
+"""Largest number of values in the normal equations of the set-ups that are fitted at one time: 64 MB. A set-up has the
+unknowns of all its arrays, so the equations of a set-up with 30 arrays have 300 000 values."""
 
 
 MIN_GAIN: Final = 7.0
-"""Least gain in the deviance of sounds at unknown places from which a set-up would be said to differ from the filed one
-if there were one array; `least_gain` raises it for more arrays. Few careful set-ups gain more than that by chance
+"""Least gain in deviance, for sounds at unknown places and one array, at which a set-up is reported as different from
+the filed one; `least_gain` is higher for more arrays. Few careful set-ups gain more by chance
 (`benchmarks/doctor_chance.py`)."""
 
 
 def least_gain(arrays: int) -> float:
-    """Return the least gain in the deviance from which a set-up is said to differ from the filed one.
+    """Return the least gain in deviance at which a set-up is reported as different from the filed one.
 
-    More arrays have more alternatives, and the best of more alternatives gains more by chance: twice the logarithm of
-    the number of arrays (Bonferroni).
+    More arrays have more alternatives, and the best of them gains more by chance: twice the logarithm of the number of
+    arrays (Bonferroni).
     """
     return MIN_GAIN + 2.0 * float(np.log(arrays))
 
 
 class Judge:
-    """Compares alternatives with the set-up as filed.
+    """Compares the alternatives with the set-up as filed, by sounds at unknown places.
 
     Parameters
     ----------
@@ -91,7 +91,7 @@ class Judge:
         return self._misfit_s(self._as_filed.set_up)
 
     def may_gain(self, least: float) -> bool:
-        """Return whether a set-up near the filed one may gain `least`, and its cost besides, in deviance."""
+        """Return whether any set-up near the filed one may gain `least` and its own cost, in deviance."""
         freer = self._hypotheses.freer(self._filed.places_m)
         found = zip(freer, self._fitted(freer), strict=True)
         return any(self.filed - fit.deviance >= least + (one.cost or 0.0) for one, fit in found)
@@ -104,14 +104,14 @@ class Judge:
         return sorted(judged, key=lambda one: one.criterion)
 
     def with_misfit(self, alternative: Alternative) -> Alternative:
-        """Return an alternative with the misfit of the sounds if the filed set-up has that change and no other."""
+        """Return an alternative with the misfit of the sounds if this is the only change to the filed set-up."""
         return replace(alternative, misfit_s=self._misfit_s(_applied(self._as_filed.set_up, alternative)))
 
     def _misfit_s(self, set_up: SetUp) -> float:
         return self._search.fit(set_up.microphones, set_up.delays, set_up.c_m_s).misfit_s
 
     def _fitted(self, tried: Sequence[Hypothesis]) -> list[Explained]:
-        """Fit hypotheses, as many together as fit into a little memory."""
+        """Fit hypotheses, in groups that need little memory."""
         most, bounds_m, found = fitted_together(tried[0].set_up), self._search.bounds_m, []
         for begin in range(0, len(tried), most):
             some = tried[begin : begin + most]
@@ -123,7 +123,7 @@ class Judge:
 
 
 def fitted_together(set_up: SetUp) -> int:
-    """Return the number of set-ups like this one that are fitted together: as many as fit into a little memory."""
+    """Return the number of set-ups like this one that are fitted together, which needs little memory."""
     sounds = len(next(iter(set_up.delays.values())))
     unknowns = unknowns_of(set_up)
     slopes = max(one.size * (8 + 3 * one.shape[1]) for one in set_up.delays.values())
@@ -155,7 +155,7 @@ def _applied(filed: SetUp, alternative: Alternative) -> SetUp:
 
 
 def _adjusted(alternative: Alternative, found: Explained, cost: float | None) -> Alternative:
-    """Return an alternative with its criterion, and with the change that was found for what it leaves free."""
+    """Return an alternative with its criterion, and with the fitted values of its free quantities."""
     others = sum(channel != index for index, channel in enumerate(alternative.order, start=1))
     judged = replace(
         alternative, criterion=found.deviance + (COSTS.get(alternative.fault, others) if cost is None else cost)

@@ -1,4 +1,4 @@
-"""Meters the level and the faults of each input of a device: over the last second, and since the beginning."""
+"""Meters the level and the faults of each input of a device, over the last second and since the start."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from livessl.core.commission.channels import (
 from livessl.core.types import ChannelLevel, Float32Array, FloatArray, IntArray
 
 RECENT_S: Final = 1.0
-"""Sound that the level of the moment is taken from, in seconds."""
+"""Length, in seconds, of the sound from which the present level is computed."""
 
 WINDOWS: Final = 10
-"""Seconds that mean, hum and noise are taken from: short enough to follow a hand at the plugs."""
+"""Number of seconds from which mean, hum and noise are computed: few enough to follow a hand at the plugs."""
 
 HUM_WINDOWS: Final = 3
-"""Seconds from which hum is reported, because a single one may hold a voice."""
+"""Number of seconds from which hum is reported, because a single second may contain a voice."""
 
 LEAST_NEIGHBOURS: Final = 3
 """Fewest channels of an array, silent ones excluded, whose noise is compared."""
@@ -39,7 +39,7 @@ class InputLevel(ChannelLevel):
     Parameters
     ----------
     faults : tuple of str
-        What is wrong, in the words of `livessl doctor`: dead, clipping, dc, hum, noisy.
+        Faults, in the words of `livessl doctor`: dead, clipping, dc, hum, noisy.
     """
 
     faults: tuple[str, ...] = ()
@@ -96,11 +96,11 @@ class LevelMeter:
             self._held -= self._recent.popleft().count
 
     def recent(self) -> tuple[InputLevel, ...]:
-        """Return the level of each input over the last second; nothing before the first sample."""
+        """Return the level of each input over the last second; empty before the first sample."""
         return self._levels(_joined([*self._recent])) if self._recent else ()
 
     def overall(self) -> tuple[InputLevel, ...]:
-        """Return the level of each input since the beginning; nothing before the first sample."""
+        """Return the level of each input since the start; empty before the first sample."""
         return self._levels(self._all) if self._recent else ()
 
     def _levels(self, sums: _Sums) -> tuple[InputLevel, ...]:
@@ -137,7 +137,7 @@ class LevelMeter:
         )
 
     def _noise_over_db(self, figures: Sequence[ChannelFigures], peak: FloatArray) -> dict[int, float]:
-        """Return how far the noise of each input is above its neighbours' in an array; silent inputs are left out."""
+        """Return how far the noise of each input is above its neighbours' in an array; silent inputs are skipped."""
         over: dict[int, float] = {}
         for inputs in self._arrays if figures else ():
             alive = [index for index in inputs if peak[index] > 0.0]

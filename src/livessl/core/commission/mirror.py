@@ -1,9 +1,9 @@
-"""Says whether sounds at unknown places leave open that the whole room is mirrored.
+"""Decides whether the whole room may be mirrored, because sounds at unknown places cannot exclude it.
 
-Arrays that are reflected in a plane, and with them all sounds, receive the same. If the centres of all arrays lie in
-the plane and the reflection of each is nearly the array itself with its channels in another order, the set-up as filed
-cannot be distinguished from one whose channels are exchanged at each array. Every place is then on the wrong side of
-the plane.
+If all arrays and all sounds are reflected in a plane, the arrays receive the same signals. Assume that the centres of
+all arrays lie in the plane, and that the reflection of each array is nearly the array itself with its channels in
+another order. The filed set-up then cannot be distinguished from one in which the channels of each array are exchanged,
+so every position may be on the wrong side of the plane.
 """
 
 from __future__ import annotations
@@ -20,25 +20,26 @@ from livessl.core.commission.places import Microphones
 from livessl.core.types import BoolArray, FloatArray
 
 MOST_TURN_DEG: Final = 25.0
-"""Largest turn of an array, in degrees, by which a reflection may differ from the filed set-up: people file poses that
-are further off less often than they exchange channels."""
+"""Largest rotation of an array, in degrees, by which a reflection may differ from the filed set-up. Larger errors of
+poses are less common than exchanged channels."""
 
 SAME_M: Final = 0.02
-"""Distance, in metres, within which centres are in one plane, and microphones at the same place. In small arrays a
-third of the least distance between microphones counts instead, so that neighbours are not taken for each other."""
+"""Distance, in metres, up to which centres count as being in one plane, and microphones as being at the same place. In
+small arrays it is a third of the least distance between microphones, so that neighbours are not confused."""
 
 BEYOND_M: Final = 0.3
-"""Distance, in metres, by which a place may be outside the search volume: places of single sounds have errors."""
+"""Largest distance, in metres, of a place from the search volume, because places of single sounds have errors."""
 
 MOST_ORDERS: Final = 100
-"""Most orders of an array's channels that are tried: a cube of eight microphones has 48 that keep all distances."""
+"""Largest number of orders of an array's channels that are tried. A cube of eight microphones has 48 orders that keep
+all distances."""
 
 PLANES: Final = 180
 """Number of planes that are tried through arrays on one line."""
 
 
 def mirrored(microphones: Microphones, places_m: FloatArray, bounds_m: FloatArray) -> BlindSpot | None:
-    """Return that the room may be mirrored, or None where that is excluded or needs too large turns of the arrays.
+    """Return a blind spot if the room may be mirrored; None if that is excluded or needs large rotations of the arrays.
 
     Parameters
     ----------
@@ -47,14 +48,14 @@ def mirrored(microphones: Microphones, places_m: FloatArray, bounds_m: FloatArra
     places_m : (S, 3) float64
         Places of the sounds in the filed set-up, metres.
     bounds_m : (3, 2) float64
-        Search volume, metres: a place that is mirrored to somewhere outside excludes the reflection.
+        Search volume, metres. A place whose mirror image is outside excludes the reflection.
 
     Returns
     -------
     BlindSpot or None
-        Of the reflection that needs the smallest turns: the arrays whose channels it exchanges, the largest of the
-        turns as `least`, and the normal of the plane as `along`. None if an array lies on one line, because its
-        reflection is a turn, and if no array needs exchanged channels: then the geometry shows it before any sound.
+        Blind spot of the reflection with the smallest rotations: the arrays whose channels are exchanged, the largest
+        rotation as `least`, and the normal of the plane as `along`. None if an array lies on one line, because its
+        reflection is a rotation. None if no array needs exchanged channels, because the geometry alone then reveals it.
     """
     if any(_is_line(at_m) for at_m in microphones.values()):
         return None
@@ -82,7 +83,7 @@ def _is_line(at_m: FloatArray) -> bool:
 
 
 def _are_inside(places_m: FloatArray, middle_m: FloatArray, normals: FloatArray, bounds_m: FloatArray) -> BoolArray:
-    """Return for each plane whether all places (S, 3), mirrored in it, are inside the search volume."""
+    """Return for each plane whether the mirror images of all places (S, 3) are inside the search volume."""
     heights_m = (places_m - middle_m) @ normals.T
     mirrored_m = places_m[:, None] - 2.0 * heights_m[..., None] * normals
     beyond_m = np.maximum(bounds_m[:, 0] - mirrored_m, mirrored_m - bounds_m[:, 1])
@@ -90,7 +91,7 @@ def _are_inside(places_m: FloatArray, middle_m: FloatArray, normals: FloatArray,
 
 
 def _normals(centres_m: FloatArray) -> FloatArray:
-    """Return unit normals (N, 3) of planes that all centres (A, 3) lie in; none if there is no such plane."""
+    """Return the unit normals (N, 3) of the planes that contain all centres (A, 3); none if there is no such plane."""
     apart_m = centres_m - centres_m.mean(axis=0)
     axes = np.linalg.svd(apart_m)[2]
     flat = axes[(np.abs(apart_m @ axes.T) <= SAME_M).all(axis=0)]
@@ -101,9 +102,10 @@ def _normals(centres_m: FloatArray) -> FloatArray:
 
 
 def _turns(at_m: FloatArray, normals: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Return the least turn, in degrees, that brings an array to each reflection, and whether channels change places.
+    """Return the least rotation, in degrees, between an array and each reflection, and whether channels are exchanged.
 
-    Infinite where no order of the channels does. The filed order is preferred if its turn is not too large.
+    The rotation is infinite if no order of the channels fits. The filed order is preferred if its rotation is small
+    enough.
     """
     own_m = at_m - at_m.mean(axis=0)
     apart_m = squareform(pdist(own_m))
@@ -126,9 +128,9 @@ def _turns(at_m: FloatArray, normals: FloatArray) -> tuple[FloatArray, BoolArray
 
 
 def _orders(are_alike: BoolArray, begun: tuple[int, ...]) -> Iterator[tuple[int, ...]]:
-    """Yield the orders of channels that begin so and keep all distances between microphones, the filed one first.
+    """Yield the orders of channels that begin with `begun` and keep all distances, the filed order first.
 
-    `are_alike` (K, K, K, K) is whether the distance between two microphones is that between two others.
+    `are_alike` (K, K, K, K) is True if the distance between two microphones equals that between two others.
     """
     index = len(begun)
     if index == len(are_alike):

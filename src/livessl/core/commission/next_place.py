@@ -13,20 +13,20 @@ from livessl.core.types import FloatArray
 
 AIM_M: Final = 0.03
 AIM_DEG: Final = 1.0
-"""Standard deviations of a pose, in metres and degrees, at which a calibration is good enough: the errors that remain
-then move positions by no more than the sounds themselves scatter."""
+"""Standard deviations of a pose, in metres and degrees, at which a calibration is good enough. The remaining errors
+then move positions by no more than positions scatter anyway."""
 
 STEP_M: Final = 0.5
-"""Spacing of the places that are proposed, metres: such places are easy to find with a tape."""
+"""Spacing of the proposed places, metres; places at multiples of it are easy to find with a tape."""
 
 HEIGHTS_M: Final = (0.5, 1.0, 1.5, 2.0)
-"""Heights of the places that are proposed, metres: a hand reaches them."""
+"""Heights of the proposed places, metres; all can be reached by hand."""
 
 MARGIN_M: Final = 0.5
 """Least distance of a proposed place from the walls, metres."""
 
 NEAREST_M: Final = 1.0
-"""Least distance of a proposed place from an array, metres: closer ones must be measured more exactly."""
+"""Least distance of a proposed place from an array, metres; nearer places would have to be measured more exactly."""
 
 APART_M: Final = 0.75
 """Least distance between two proposed places, metres."""
@@ -44,7 +44,7 @@ def proposed_place(
     Parameters
     ----------
     microphones : mapping of array to (K, 3) float64
-        As far as they are known, metres.
+        Known or assumed positions of the microphones, metres.
     places_m : (S, 3) float64
         Places of the claps so far, metres; S may be 0.
     bounds_m : (3, 2) float64
@@ -52,7 +52,7 @@ def proposed_place(
     c_m_s : float
         Speed of sound, m/s.
     place_std_m : float
-        How exactly places are known along each axis, metres.
+        Standard deviation of places along each axis, metres.
 
     Returns
     -------
@@ -81,12 +81,12 @@ def expected_stds(
 
 
 def _rough() -> FloatArray:
-    """Information (6, 6) on a pose before any clap."""
+    """Return the information (6, 6) on a pose before any clap."""
     return np.diag([_ROUGH_M**-2.0] * 3 + [np.radians(_ROUGH_DEG) ** -2.0] * 3)
 
 
 def _candidates(microphones: Microphones, places_m: FloatArray, bounds_m: FloatArray) -> FloatArray:
-    """Places (G, 3) on a grid, away from walls, arrays and the claps so far, metres."""
+    """Return the places (G, 3) on a grid, away from walls, arrays and the claps so far, metres."""
     axes = [
         np.arange(np.ceil((low + MARGIN_M) / STEP_M) * STEP_M, high - MARGIN_M + 1e-9, STEP_M) for low, high in bounds_m
     ]
@@ -102,7 +102,7 @@ def _candidates(microphones: Microphones, places_m: FloatArray, bounds_m: FloatA
 
 
 def _information(microphones_m: FloatArray, places_m: FloatArray, c_m_s: float, place_std_m: float) -> FloatArray:
-    """Fisher information (S, 6, 6) of one clap at each place on the shift (m) and turn (radians) of an array.
+    """Return the Fisher information (S, 6, 6) on an array's shift (m) and rotation (rad) of a clap at each place.
 
     The place of the clap is a nuisance with its own standard deviation: it adds to the covariance of the delays.
     """

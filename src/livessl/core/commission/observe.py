@@ -1,7 +1,7 @@
-"""Delays of one sound between the microphones of one array, measured without knowing where they are.
+"""Measures the delays of a sound between the microphones of an array, without using their positions.
 
-The poses, the geometry and the order of the channels in the site file are not used, so that they can be examined
-with the result. The polarity of each microphone is measured with its delay: an inverted one turns the peaks of its
+The poses, the geometry and the order of the channels in the site file are not used, so that they can be examined with
+the result. The polarity of each microphone is measured with its delay: an inverted microphone turns the peaks of its
 pairs upside down.
 """
 
@@ -17,35 +17,36 @@ from livessl.core.correlate.band import uses_envelope
 from livessl.core.types import Evidence, Float32Array, FloatArray, IntArray, Observation, Received
 
 PEAKS: Final = 3
-"""Peaks of each pair, up and down, that are tried as its delay: reverberation and tones have several."""
+"""Number of peaks of each pair, positive and negative, that are tried as its delay; reverberation and tones cause
+several."""
 
 BEAM: Final = 8
-"""Most partial solutions that are kept while one microphone after the other is added."""
+"""Largest number of partial solutions that are kept while microphones are added one by one."""
 
 NEAR_STEPS: Final = 4
-"""Steps of the lag axis within which each pair's own peak is searched for around the common delays."""
+"""Number of steps of the lag axis around the common delays within which each pair's own peak is searched for."""
 
 INVERSION: Final = 1.15
-"""Ratio by which the peaks must be higher with some microphones inverted than with none: reverberation alone gives
-some pairs a deeper trough than a peak."""
+"""Least ratio of the peaks with some microphones inverted to the peaks with none inverted. Reverberation alone can make
+a trough larger than the peak in some pairs."""
 
 LEAST_SHARPNESS: Final = 3.5
-"""Sharpness below which an observation counts for nothing: noise alone gives up to 3."""
+"""Sharpness below which an observation is not used; noise alone has up to 3."""
 
 
 def receive(evidence: Evidence, segments: Iterable[Float32Array]) -> Received:
-    """Keep what `observe` needs of an array's evidence and of its samples, segments of (K, n)."""
+    """Return the parts of an array's evidence and samples, segments of (K, n), that `observe` needs."""
     return Received(replace(evidence, background=None, beginning=None), _powers(segments))
 
 
 def observe(received: Iterable[Received]) -> tuple[Observation, ...]:
-    """Measure what the channels of each array received of a sound; arrays without an exact delay are left out."""
+    """Measure the delays and polarities of a sound at the channels of each array; skip arrays without exact delays."""
     observed = (_observe(one.evidence, one.powers) for one in received)
     return tuple(one for one in observed if one is not None)
 
 
 def _observe(evidence: Evidence, powers: FloatArray) -> Observation | None:
-    """Measure what the channels of one array received of a sound.
+    """Measure the delays and polarities of a sound at the channels of one array.
 
     The delays t and polarities s are those for which the sum over all pairs (i, k) of s_i s_k R_ik(t_k - t_i) is
     highest. Microphones are added one by one; the candidates of each are the highest peaks of its pairs. Return None if
@@ -64,7 +65,7 @@ def _observe(evidence: Evidence, powers: FloatArray) -> Observation | None:
 
 
 def _powers(segments: Iterable[Float32Array]) -> FloatArray:
-    """Mean power (K,) of the first differences, which attenuate hum and rumble and leave out a constant."""
+    """Return the mean power (K,) of the first differences, which attenuate hum and rumble and remove constants."""
     differences = [np.diff(segment, axis=1) for segment in segments]
     count = max(1, sum(one.shape[1] for one in differences))
     sums = [np.einsum("kn,kn->k", one, one, dtype=np.float64) for one in differences]
@@ -165,12 +166,12 @@ class _Pairs:
         return self._tops[pair, sign]
 
     def _at(self, values: FloatArray, lags_s: FloatArray) -> FloatArray:
-        """Interpolated correlation at lags; 0 outside the axis."""
+        """Return the interpolated correlation at lags; 0 outside the axis."""
         places = (lags_s - self._first_s) / self._step_s
         return np.interp(places, self._steps, values, left=0.0, right=0.0)
 
     def _peak_near(self, values: FloatArray, lag_s: float) -> tuple[float, float]:
-        """Lag and height of the highest point near a lag, between the steps by a parabola."""
+        """Return lag and height of the highest point near a lag, interpolated by a parabola."""
         place = round((lag_s - self._first_s) / self._step_s)
         low, high = max(1, place - NEAR_STEPS), min(self._lags - 2, place + NEAR_STEPS)
         if low > high:

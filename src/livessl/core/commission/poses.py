@@ -1,8 +1,8 @@
-"""Measures the poses of arrays from the delays of sounds: bundle adjustment.
+"""Measures the poses of arrays from the delays of sounds by bundle adjustment.
 
-The unknowns are the turn and the shift of each array that may move, the speed of sound if it may differ, and the places
-of the sounds. Places that are known, and poses as far as they are known, enter as priors. The arrays need no common
-clock; where some have one, the times between them may be used as well.
+The unknowns are the rotation and the shift of each array that may move, the speed of sound if it may differ, and the
+places of the sounds. Known places and poses are priors, with their standard deviations. The arrays need no common
+clock. If some arrays have a common clock, the times between them can be used as well.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ DELAY_STD_S: Final = 20e-6
 """Standard deviation of a measured delay in a room, seconds."""
 
 MICROPHONE_STD_M: Final = 0.002
-"""Standard deviation of each microphone's place within its array, metres: arrays are built to some millimetres. The
-error of a place is the same in all sounds, so more sounds do not average it out."""
+"""Standard deviation of each microphone's place within its array, metres, because arrays are built with errors of some
+millimetres. The error of a place is the same for all sounds, so more sounds do not reduce it."""
 
 UNKNOWN_M: Final = 100.0
 UNKNOWN_DEG: Final = 360.0
 """Standard deviations, in metres and degrees, that stand for "unknown"."""
 
 LINE: Final = 0.01
-"""Width over length up to which an array is a line."""
+"""Ratio of width to length up to which an array counts as a line."""
 
 _TOLERANCE: Final = 1e-5
 """Relative change of cost and unknowns below which the adjustment ends."""
@@ -41,7 +41,7 @@ _STEP: Final = 1e-4
 """Step of the numerical derivatives, in units of the scales of the unknowns (`_SHIFT_SCALE_M` and those below)."""
 
 _UNKNOWNS: Final = 6
-"""Unknowns of a pose: three of the shift, three of the turn."""
+"""Number of unknowns of a pose: three of the shift, three of the rotation."""
 
 _SHIFT_SCALE_M: Final = 0.1
 _TURN_SCALE_RAD: Final = 0.1
@@ -55,11 +55,11 @@ class Freedom:
     Parameters
     ----------
     arrays : mapping of array to (float, float)
-        Of the position in metres and of the orientation in degrees; arrays that are not named keep their poses.
+        Standard deviations of the position in metres and of the orientation in degrees. Other arrays keep their poses.
     speed_std_m_s : float
-        Of the speed of sound, m/s; 0 if the speed is known.
+        Standard deviation of the speed of sound, m/s; 0 if the speed is known.
     microphone_std_m : float
-        Of each microphone's place within its array along each axis, metres; 0 if the places are known.
+        Standard deviation of each microphone's place in its array along each axis, metres; 0 if the places are known.
     """
 
     arrays: Mapping[str, tuple[float, float]]
@@ -69,16 +69,16 @@ class Freedom:
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """Difference between the pose of an array and that of the site file.
+    """Difference between the pose of an array and its pose in the site file.
 
     Parameters
     ----------
     shift_m : (3,) float64
-        Shift of its centre, metres.
+        Shift of the centre of the array, metres.
     turn_deg : (3,) float64
-        Turn about its centre: a vector along the axis, its length in degrees.
+        Rotation about the centre: a vector along the axis, whose length is the angle in degrees.
     covariance : (6, 6) float64
-        Of the shift (m) and the turn (radians).
+        Covariance of the shift (m) and the rotation (radians).
     """
 
     shift_m: FloatArray
@@ -87,7 +87,7 @@ class Pose:
 
     @property
     def angle_deg(self) -> float:
-        """Size of the turn, degrees."""
+        """Angle of the rotation, degrees."""
         return float(np.linalg.norm(self.turn_deg))
 
     @property
@@ -96,7 +96,7 @@ class Pose:
         return float(np.linalg.norm(self.shift_m))
 
     def applied(self, microphones_m: FloatArray) -> FloatArray:
-        """Positions (K, 3) of the microphones after the turn and the shift, metres."""
+        """Return the positions (K, 3) of the microphones after the rotation and the shift, metres."""
         return moved(microphones_m, self.shift_m, np.radians(self.turn_deg))
 
 
@@ -112,12 +112,12 @@ class Adjusted:
     c_std_m_s : float
         Standard deviation of the speed of sound, m/s; 0 if the speed was known.
     places_m : (S, 3) float64
-        Where the sounds were, metres.
+        Places of the sounds, metres.
     misfits_s : (S,) float64
-        Root mean square of what remains of each sound's delays, seconds.
+        Root mean square of the residuals of each sound's delays, seconds.
     microphones : mapping of array to (K, 3) float64
-        Positions of the microphones, metres. If their places within the arrays are not known, the offsets that the
-        sounds show are included.
+        Positions of the microphones, metres. If their places within the arrays are unknown, the measured offsets are
+        included.
     """
 
     poses: Mapping[str, Pose]
@@ -144,13 +144,13 @@ def adjust(
     Parameters
     ----------
     microphones : mapping of array to (K, 3) float64
-        As in the site file, or a rough guess, metres.
+        Positions in the site file, or a rough guess, metres.
     delays : mapping of array to (S, K) float64
         Seconds.
     places_m : (S, 3) float64
-        Where the sounds were, or where to begin, metres.
+        Places of the sounds, or places at which to begin, metres.
     c_m_s : float
-        Speed of sound as in the site file, m/s.
+        Speed of sound in the site file, m/s.
     freedom : Freedom
     place_std_m : float
         Standard deviation of the given places along each axis, metres.
@@ -177,7 +177,7 @@ def adjust(
 
 
 class _Problem:
-    """The adjustment as a vector of unknowns and one of residuals in standard deviations."""
+    """The adjustment as a vector of unknowns and a vector of residuals in standard deviations."""
 
     def __init__(
         self,
@@ -217,7 +217,7 @@ class _Problem:
         return unknowns
 
     def residuals(self, unknowns: FloatArray) -> FloatArray:
-        """Delays and priors, in standard deviations."""
+        """Return the residuals of delays and priors, in standard deviations."""
         poses, speed_m_s, places_m = self._unpack(unknowns)
         at_m = self._moved(poses, unknowns)
         parts = [contradictions_s(at_m, self._delays, places_m, speed_m_s).ravel() / self._delay_std_s]
@@ -235,7 +235,7 @@ class _Problem:
         return np.concatenate(parts)
 
     def slopes(self, unknowns: FloatArray) -> FloatArray:
-        """Slope of the residuals: by differences for poses, speed and microphones, exact for the places."""
+        """Return the slope of the residuals: by differences for poses, speed and microphones, exact for places."""
         here = self.residuals(unknowns)
         slopes = np.zeros((len(here), len(unknowns)))
         few = len(unknowns) - self._places_m.size
@@ -260,7 +260,7 @@ class _Problem:
         return slopes
 
     def result(self, unknowns: FloatArray, jacobian: FloatArray) -> Adjusted:
-        """The unknowns as a result, with the covariance from the slope of the residuals."""
+        """Return the result for the unknowns, with the covariance from the slope of the residuals."""
         poses, speed_m_s, places_m = self._unpack(unknowns)
         covariance = np.asarray(np.linalg.pinv(jacobian.T @ jacobian, hermitian=True), dtype=np.float64)
         at_m = self._moved(poses, unknowns)
@@ -287,12 +287,12 @@ class _Problem:
         return poses, float(speed_m_s), unknowns[-self._places_m.size :].reshape(-1, 3)
 
     def _offsets(self, unknowns: FloatArray) -> FloatArray:
-        """Offsets of all microphones from their places within the arrays, metres."""
+        """Return the offsets of all microphones from their places within the arrays, metres."""
         first = len(self._free) * _UNKNOWNS + (self._freedom.speed_std_m_s > 0.0)
         return unknowns[first : -self._places_m.size]
 
     def _moved(self, poses: Mapping[str, tuple[FloatArray, FloatArray]], unknowns: FloatArray) -> dict[str, FloatArray]:
-        """Places (K, 3) of the microphones of each array, metres."""
+        """Return the places (K, 3) of the microphones of each array, metres."""
         offsets_m, found = self._offsets(unknowns).reshape(-1, 3), {}
         for name in self._delays:
             at_m = self._microphones[name]
@@ -304,13 +304,13 @@ class _Problem:
 
 
 def moved(microphones_m: FloatArray, shift_m: FloatArray, turn: FloatArray) -> FloatArray:
-    """Return positions (K, 3) after a turn about their centre (a rotation vector, radians) and then a shift, metres."""
+    """Return positions (K, 3), metres, after a rotation about their centre (a vector, radians) and then a shift."""
     centre_m = microphones_m.mean(axis=0)
     return np.asarray(Rotation.from_rotvec(turn).apply(microphones_m - centre_m) + centre_m + shift_m)
 
 
 def line_axis(microphones_m: FloatArray) -> FloatArray | None:
-    """Return the direction (3,) of the line on which microphones (K, 3) lie; None if they lie on none.
+    """Return the direction (3,) of the line on which microphones (K, 3) lie; None if they lie on no line.
 
     Two microphones always lie on a line.
     """
@@ -319,10 +319,10 @@ def line_axis(microphones_m: FloatArray) -> FloatArray | None:
 
 
 def without_spin(covariance: FloatArray, microphones_m: FloatArray) -> FloatArray:
-    """Return the covariance (..., 6, 6) of a pose, without the turn of a line of microphones about its own axis.
+    """Return the covariance (..., 6, 6) of a pose, without the rotation of a line of microphones about its own axis.
 
-    Such a turn moves no microphone, so no sound determines it and nothing depends on it. The covariance of an array
-    that is no line is returned unchanged.
+    Such a rotation moves no microphone, so no sound determines it and no position depends on it. The covariance of an
+    array that is not a line is returned unchanged.
     """
     axis = line_axis(microphones_m)
     if axis is None:

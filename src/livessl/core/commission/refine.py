@@ -1,8 +1,8 @@
 """Refines the poses of arrays and the speed of sound from sounds at unknown places, with at least one array known.
 
 The places of the sounds and the poses are estimated together. The delays within the arrays are enough: the arrays need
-no common clock. Where some arrays have one, the times between these arrays determine distances. Sounds at unknown
-places do not show where in the room the whole set-up is, so one array at least stays as it is filed.
+no common clock. If some arrays have one, the times between these arrays determine distances. Sounds at unknown
+places do not reveal where in the room the whole set-up is, so at least one array keeps its filed pose.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from livessl.core.commission.resection import SPEED_STD_M_S, MeasuredSetUp, desc
 from livessl.core.types import FloatArray
 
 LEAST_UNKNOWN: Final = 10
-"""Fewest sounds at unknown places from which an array is refined: each sound brings three unknowns of its own."""
+"""Fewest sounds at unknown places from which an array is refined; each sound adds three unknowns."""
 
 POSITION_STD_M: Final = 0.5
-"""Standard deviation of a filed position that is refined, metres: as exact as one that is paced out."""
+"""Standard deviation of a filed position that is refined, metres: that of a position measured in paces."""
 
 OUTLIER: Final = 3.5
 """Misfit of a sound, in medians of all misfits, above which the sound is not used: an array received an echo or another
@@ -35,8 +35,8 @@ LEAST_OUTLIER_S: Final = 30e-6
 """Misfit, in seconds, below which no sound is an outlier."""
 
 CONTRADICTION: Final = 3.0
-"""Misfit with the times between arrays, in misfits without these times, above which the times contradict the delays.
-Then the times are left out, and positions are no better known than in the site file."""
+"""Ratio of the misfit with the times between arrays to the misfit without them, above which the times contradict the
+delays. The times are then not used, and positions remain as uncertain as in the site file."""
 
 LEAST_STD_S: Final = 5e-6
 """Least standard deviation of the delays that is assumed, seconds."""
@@ -69,14 +69,14 @@ def refine(
     known : collection of str
         Arrays that stay as they are filed.
     arrivals : Arrivals or None
-        When arrays that share a clock received the same sounds.
+        Times at which arrays that share a clock received the same sounds.
     position_std_m : float
         Standard deviation of the filed positions along each axis, metres.
 
     Returns
     -------
     MeasuredSetUp
-        With the poses of the arrays that are not `known`. The misfits of a pose are those of all arrays together.
+        Poses of the arrays that are not `known`. The misfits of a pose are those of all arrays together.
 
     Raises
     ------

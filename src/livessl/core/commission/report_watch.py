@@ -1,4 +1,4 @@
-"""Finds faults in what nodes report of their channels and machines, with or without sounds. It reads no clock."""
+"""Finds faults in the reports of nodes about their channels and machines, with or without sounds. It reads no clock."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from livessl.core.commission.finding import Finding, Severity
 from livessl.core.types import ChannelLevel, HostState
 
 REPORTED: Final = frozenset({"clipping", "cpu", "dc", "hum", "noisy", "ntp"})
-"""Codes of the faults that reports show."""
+"""Codes of the faults that are found in reports."""
 
 STEADY: Final = 10
-"""Number of the last reports, one a second, that decide about a constant, hum and noise."""
+"""Number of latest reports, one per second, that decide about a constant, hum and noise."""
 
 BEGINS: Final = 8
 ENDS: Final = 2
-"""Number of these that must show such a fault for it to be reported, and number down to which it stays reported: a
-fault at the limit does not come and go."""
+"""Number of the latest `STEADY` reports with a fault from which it is reported, and number down to which it stays
+reported. The difference prevents a fault at the limit from alternating."""
 
 RECENT_S: Final = 60.0
-"""Time, in seconds, for which clipping and lost blocks stay reported, and after which a silent node says nothing."""
+"""Time, in seconds, for which clipping and lost blocks stay reported, and after which a silent node is ignored."""
 
 MOST_LOST: Final = 2
-"""Blocks lost in that time that are not reported yet."""
+"""Largest number of blocks lost in `RECENT_S` that is not reported."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +37,7 @@ class _Report:
 
 
 class _Array:
-    """The last reports of one array."""
+    """The latest reports of one array."""
 
     def __init__(self) -> None:
         self.recent: deque[_Report] = deque()
@@ -75,7 +75,7 @@ class _Array:
                 yield Finding("clipping", array, index + 1, Severity.WARNING, 0.95, what, CLIPPING_CURE)
 
     def lost_blocks(self) -> int:
-        """Return the blocks that the node lost in the last minute because its machine did not keep up."""
+        """Return the number of blocks that the node lost in the last minute because its machine did not keep up."""
         counts = [report.host.lost_blocks for report in self.recent if report.host is not None]
         return counts[-1] - counts[0] if counts else 0
 
@@ -90,7 +90,7 @@ class _Array:
 
 
 class ReportWatch:
-    """Keeps the reports of the last minute, and says what is wrong by them."""
+    """Keeps the reports of the last minute, and finds faults in them."""
 
     def __init__(self) -> None:
         self._arrays: dict[str, _Array] = {}
@@ -104,19 +104,19 @@ class ReportWatch:
         levels : sequence of ChannelLevel
             Levels of its channels.
         host : HostState or None
-            State of its node's machine.
+            State of the node's machine.
         time_s : float
-            When the report was received, seconds by any clock that only goes forward.
+            Time at which the report was received, seconds of any monotonic clock.
         """
         self._arrays.setdefault(array, _Array()).take(array, _Report(time_s, tuple(levels), host))
 
     def findings(self, nodes: Mapping[str, str | None], time_s: float) -> list[Finding]:
-        """Return what is wrong now.
+        """Return the present faults.
 
         Parameters
         ----------
         nodes : mapping of array to node
-            The node of each array, as the site file says; None for an array without one.
+            The node of each array in the site file; None for an array without a node.
         time_s : float
             Present time, as in `take`.
         """
@@ -134,9 +134,9 @@ class ReportWatch:
 
 
 def _of_machines(hosts: Mapping[str, HostState | None], lost: Mapping[str, int]) -> Iterator[Finding]:
-    """Yield the faults of the nodes' machines: those that do not keep up, and clocks that follow no other.
+    """Yield the faults of the nodes' machines: machines that do not keep up, and clocks that are not synchronized.
 
-    Nodes on one machine share its clock, so their times agree, whatever it follows.
+    If all nodes are on one machine, their times agree even if its clock is not synchronized.
     """
     for node, count in sorted(lost.items()):
         if count > MOST_LOST:

@@ -1,4 +1,4 @@
-"""Measures the pose of an array from sounds at known places, wherever the site file has it."""
+"""Measures the pose of an array from sounds at known places, even if the pose in the site file is far off."""
 
 from __future__ import annotations
 
@@ -25,25 +25,25 @@ from livessl.core.commission.poses import (
 from livessl.core.types import BoolArray, FloatArray
 
 LEAST_PLACES: Final = 4
-"""Fewest places from which a pose is measured: three leave nothing to check it with."""
+"""Fewest places from which a pose is measured; with three, the pose could not be checked."""
 
 REACH_M: Final = 6.0
-"""Distance beyond the places, in metres, within which an array is searched for."""
+"""Largest distance, in metres, from the places at which an array is searched for."""
 
 STEPS_M: Final = (1.0, 0.25)
-"""Steps of that search, metres."""
+"""Step sizes of the search for an array, metres."""
 
 POINTS_TOGETHER: Final = 4096
-"""Points that are tried at one time, so that a search in a hall takes little memory."""
+"""Number of points that are tried at one time, so that a search in a hall takes little memory."""
 
 NEAREST_M: Final = 0.1
 """Least distance of an array from a sound, metres."""
 
 CLAP_STD_S: Final = 12e-6
-"""Standard deviation of the delays of a clap, seconds: it is short and loud, and its delays are sharper than others."""
+"""Standard deviation of the delays of a clap, seconds. Claps are short and loud, so their delays are more exact."""
 
 LEAST_CLAP_STD_S: Final = 2e-6
-"""Least standard deviation of the delays of claps that is assumed where they fit that well, seconds."""
+"""Least standard deviation of the delays of claps that is assumed, seconds, even if they fit better."""
 
 SPEED_STD_M_S: Final = 3.0
 """Standard deviation of the filed speed of sound, m/s: five degrees of temperature."""
@@ -55,22 +55,22 @@ MOST_STD_DEG: Final = 3.0
 
 @dataclass(frozen=True, slots=True)
 class MeasuredPose:
-    """The pose of one array as sounds at known places say.
+    """The pose of one array, measured by sounds at known places.
 
     Parameters
     ----------
     microphones_m : (K, 3) float64
         Measured places of the microphones, metres.
     shift_m : (3,) float64
-        From the filed centre to the measured one, metres.
+        Shift from the filed centre to the measured one, metres.
     turn : Rotation
-        From the filed orientation to the measured one, about the centre.
+        Rotation from the filed orientation to the measured one, about the centre.
     position_std_m, orientation_std_deg : float
         Largest standard deviations along any axis.
     misfit_before_s, misfit_s : float
         Misfit of the sounds with the filed pose and with the measured one, seconds.
     covariance : (6, 6) float64
-        Of the position (m) and the turn (radians). A line of microphones has no turn about itself.
+        Covariance of the position (m) and the rotation (radians). A line of microphones has no rotation about itself.
     """
 
     microphones_m: FloatArray
@@ -93,8 +93,8 @@ def measure_pose(
 ) -> MeasuredPose:
     """Measure the pose of an array whose geometry is known.
 
-    The adjustment begins at the filed pose and at the one that the directions of the sounds say; the better of the two
-    results is returned.
+    One adjustment begins at the filed pose, another at a rough pose from the directions of the sounds. The better
+    result is returned.
 
     Parameters
     ----------
@@ -103,11 +103,11 @@ def measure_pose(
     delays_s : (S, K) float64
         Delays of the sounds, seconds.
     places_m : (S, 3) float64
-        Where the sounds were made, metres.
+        Places at which the sounds were made, metres.
     c_m_s : float
         Speed of sound, m/s.
     place_std_m : float
-        How exactly the places are known along each axis, metres.
+        Standard deviation of the places along each axis, metres.
 
     Raises
     ------
@@ -137,7 +137,7 @@ def measure_pose(
 
 @dataclass(frozen=True, slots=True)
 class MeasuredSetUp:
-    """The poses of several arrays and the speed of sound as the same sounds say.
+    """The poses of several arrays and the speed of sound, measured by the same sounds.
 
     Parameters
     ----------
@@ -145,9 +145,9 @@ class MeasuredSetUp:
     c_m_s, c_std_m_s : float
         Speed of sound and its standard deviation, m/s.
     places_m : (S, 3) float64
-        Where the sounds were, metres; NaN for those that were not used.
+        Places of the sounds, metres; NaN for sounds that were not used.
     misfit_s : float
-        Misfit of all of them with the measured set-up, seconds.
+        Misfit of all used sounds with the measured set-up, seconds.
     """
 
     poses: Mapping[str, MeasuredPose]
@@ -167,9 +167,9 @@ def measure_poses(
 ) -> MeasuredSetUp:
     """Measure the poses of all arrays that received enough of the sounds, and the speed of sound.
 
-    Each array is measured by itself first. Then all are adjusted together: they share the errors of the places, and the
-    speed of sound. The places of the microphones within their arrays are measured as well; their errors would turn the
-    directions of all sounds.
+    Each array is first measured alone. Then all arrays are adjusted together, because they share the errors of the
+    places and the speed of sound. The places of the microphones within their arrays are measured as well, because their
+    errors would change the directions of all sounds.
 
     Parameters
     ----------
@@ -207,9 +207,9 @@ def measure_poses(
 
 
 def _delay_std_s(adjusted: Adjusted, delays: Delays) -> float:
-    """Estimate the standard deviation of delays, seconds, from what a set-up leaves of them.
+    """Estimate the standard deviation of delays, seconds, from their residuals.
 
-    The misfits are root mean squares per delay; each pose takes six of the delays, the speed of sound one.
+    The misfits are root mean squares per delay. Each pose uses six degrees of freedom, the speed of sound one.
     """
     counts = np.sum([np.maximum(np.isfinite(one).sum(axis=1) - 1, 0) for one in delays.values()], axis=0)
     rows = int(counts.sum())
@@ -218,14 +218,14 @@ def _delay_std_s(adjusted: Adjusted, delays: Delays) -> float:
 
 
 def received(delays_s: FloatArray) -> BoolArray:
-    """Sounds (S,) that an array received with two channels or more, from delays (S, K)."""
+    """Return the sounds (S,) that an array received with two channels or more, from delays (S, K)."""
     return np.asarray(np.isfinite(delays_s).sum(axis=1) > 1)
 
 
 def described_pose(
     filed_m: FloatArray, measured_m: FloatArray, pose: Pose, misfit_before_s: float, misfit_s: float
 ) -> MeasuredPose:
-    """Describe measured microphones (K, 3) against the filed ones, metres; misfits are in seconds."""
+    """Describe the difference of measured microphones (K, 3) from filed ones, metres; misfits are in seconds."""
     turn = turn_between(filed_m, measured_m)
     covariance = without_spin(pose.covariance, turn.apply(filed_m - filed_m.mean(axis=0)))
     variance = np.maximum(np.diag(covariance), 0.0)
@@ -242,7 +242,7 @@ def described_pose(
 
 
 def turn_between(filed_m: FloatArray, measured_m: FloatArray) -> Rotation:
-    """Return the turn about its centre that takes an array (K, 3) from one pose to another, metres."""
+    """Return the rotation about its centre between two poses of an array (K, 3), metres."""
     arms_m, filed_arms_m = measured_m - measured_m.mean(axis=0), filed_m - filed_m.mean(axis=0)
     if line_axis(filed_m) is not None:  # its longest arm says all; more of them leave the turn about it open
         longest = [int(np.linalg.norm(filed_arms_m, axis=1).argmax())]
@@ -266,10 +266,10 @@ def _misfit_s(adjusted: Adjusted) -> float:
 def from_known_places(
     microphones_m: FloatArray, delays_s: FloatArray, places_m: FloatArray
 ) -> tuple[FloatArray, FloatArray] | None:
-    """Find a rough pose of one array from sounds at known places: where to begin an adjustment.
+    """Find a rough pose of one array from sounds at known places, at which an adjustment can begin.
 
-    Each sound's delays give its direction in the array's own frame. A position is tried at each point of a grid around
-    the places; the turn that takes the directions to those towards the places is Wahba's problem.
+    The delays of each sound give its direction in the coordinates of the array. At each point of a grid around the
+    places, the rotation from these directions to the directions towards the places is computed (Wahba's problem).
 
     Parameters
     ----------
@@ -283,8 +283,8 @@ def from_known_places(
     Returns
     -------
     (3,) float64 and (3,) float64, or None
-        Shift of the array's centre in metres, and turn about it as a vector in radians. None if fewer than two sounds
-        have a direction, or the array is a line or a plane, whose delays have none.
+        Shift of the array's centre in metres, and rotation about the centre as a vector in radians. None if fewer than
+        two sounds have a direction, or if the array is a line or a plane, whose delays give no direction.
     """
     centre_m = microphones_m.mean(axis=0)
     arms_m = microphones_m - centre_m
@@ -307,9 +307,9 @@ def from_known_places(
 
 
 def _contradictions(points_m: FloatArray, places_m: FloatArray, directions: FloatArray) -> FloatArray:
-    """Return how badly the best turn takes directions (S, 3) to those from each point towards the places, (G,).
+    """Return the remaining error (G,) of the best rotation of directions (S, 3) to those from each point to the places.
 
-    The turn itself is not needed: the least sum of squares follows from the singular values of the sum of outer
+    The rotation itself is not needed: the least sum of squares follows from the singular values of the sum of outer
     products (Wahba's problem; Markley 1988).
     """
     towards = places_m[None] - points_m[:, None]

@@ -1,4 +1,4 @@
-"""Set-ups that some sounds have to be explained by, stacked so that all of them are fitted in one computation."""
+"""Stacks several set-ups with the delays of some sounds, so that all of them are fitted in one computation."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ SPEED_STD_M_S: Final = 1.5
 """Standard deviations of a careful set-up, along each axis: metres, degrees, metres and m/s."""
 
 DELAY_STD_S: Final = 6e-6
-"""Standard deviation, in seconds, of a delay in a room that is no outlier, where nothing else is known of it."""
+"""Standard deviation, in seconds, of a delay in a room that is no outlier, if no other value is known."""
 
 _STEPS: Final = 25
-"""Most steps of the refinement of places, which ends after a handful."""
+"""Largest number of steps of the refinement of places; usually it ends after a few."""
 
 _FIRST_DAMPING: Final = 1e-3
 _ENOUGH_M: Final = 1e-3
@@ -37,9 +37,9 @@ class Freedom:
     position_m : float
         Metres.
     orientation_deg : (3,) float64
-        About x, y and z, degrees.
+        Standard deviations about x, y and z, degrees.
     microphones_m : (K,) float64
-        Of each microphone, metres.
+        Standard deviation of each microphone, metres.
     """
 
     position_m: float
@@ -49,14 +49,14 @@ class Freedom:
 
 @dataclass(frozen=True, slots=True)
 class SetUp:
-    """A set-up, the delays of some sounds in it, and how far it may be from what is given.
+    """A set-up, the delays of some sounds in it, and its standard deviations.
 
     Parameters
     ----------
     microphones : mapping of array to (K, 3) float64
         Metres.
     delays : mapping of array to (S, K) float64
-        Seconds; NaN where there is none.
+        Delays in seconds; NaN if a channel has no delay.
     c_m_s, speed_std_m_s : float
         Speed of sound and its standard deviation, m/s.
     freedom : mapping of array to Freedom
@@ -78,7 +78,7 @@ class SetUp:
 def careful(
     microphones: Microphones, position_std_m: float = POSITION_STD_M, orientation_std_deg: float = ORIENTATION_STD_DEG
 ) -> dict[str, Freedom]:
-    """Return the freedom of arrays that were set up with care, or as exactly as these standard deviations say."""
+    """Return the freedom of arrays that were set up with care, or with the given standard deviations."""
     return {
         name: Freedom(position_std_m, np.full(3, orientation_std_deg), np.full(len(at_m), MICROPHONE_STD_M))
         for name, at_m in microphones.items()
@@ -100,7 +100,7 @@ class Known:
     stds_s: Mapping[str, FloatArray] = field(default_factory=dict)
 
     def of_sounds(self, rows: IntArray) -> Known:
-        """Return what is known of some of the sounds."""
+        """Return the accuracy for some of the sounds."""
         return Known(self.freedom, {name: one[rows] for name, one in self.stds_s.items()})
 
 
@@ -110,7 +110,7 @@ class Stacked:
     Parameters
     ----------
     set_ups : sequence of SetUp
-        They have the same arrays with as many microphones, and as many sounds.
+        Set-ups with the same arrays, the same numbers of microphones, and the same number of sounds.
     bounds_m : (3, 2) float64
         Search volume, metres.
 
@@ -119,9 +119,9 @@ class Stacked:
     microphones : dict of array to (H, K, 3) float64
         Metres.
     there : dict of array to (H, S, K) bool
-        Whether a channel has a delay of a sound.
+        Whether a channel has a delay for a sound.
     measured_s : dict of array to (H, S, K) float64
-        Delays against the mean of the array's channels, seconds.
+        Delays minus the mean over the array's channels, seconds.
     std_s : dict of array to (H, S) float64
         Standard deviations of the delays, seconds.
     c_m_s : (H,) float64
@@ -144,16 +144,16 @@ class Stacked:
             self.std_s[name] = np.stack([one.stds_s.get(name, unknown_s) for one in set_ups])
 
     def placed(self, starts_m: FloatArray, but: Sequence[tuple[str, int] | None] = ()) -> FloatArray:
-        """Find the places (H, S, 3) that explain the delays best, the set-ups exactly as given, metres.
+        """Find the places (H, S, 3), metres, that explain the delays best in the set-ups as given.
 
         All places are refined together by the method of Levenberg and Marquardt, within the search volume.
 
         Parameters
         ----------
         starts_m : (H, S, 3) float64
-            Places to begin at, metres.
+            Places at which the search begins, metres.
         but : sequence of (str, int) or None
-            For each set-up, the array and index of a channel that is left out.
+            For each set-up, the array and index of a channel that is not used; None to use all.
         """
         there = {name: one.copy() for name, one in self.there.items()}
         for row, left_out in enumerate(but):
@@ -184,7 +184,7 @@ class Stacked:
     def _off_and_slope(
         self, places_m: FloatArray, there: dict[str, BoolArray], measured_s: dict[str, FloatArray]
     ) -> tuple[FloatArray, FloatArray]:
-        """Residuals (H, S, R) of the delays, seconds, and their slopes (H, S, R, 3) by the places."""
+        """Return the residuals (H, S, R) of the delays, seconds, and their slopes (H, S, R, 3) by the places."""
         offs, slopes = [], []
         for name in self.names:
             away_m, unit = away(places_m, self.microphones[name])
@@ -195,19 +195,19 @@ class Stacked:
 
 
 def away(places_m: FloatArray, microphones_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Distances (H, S, K) of places (H, S, 3) from microphones (H, K, 3), metres, and unit vectors (H, S, K, 3)."""
+    """Return distances (H, S, K), metres, and unit vectors (H, S, K, 3) to places (H, S, 3) from microphones."""
     towards = places_m[:, :, None] - microphones_m[:, None]
     away_m = np.maximum(np.sqrt(np.einsum("hski,hski->hsk", towards, towards)), 1e-9)
     return away_m, towards / away_m[..., None]
 
 
 def centred_where(values: FloatArray, there: BoolArray) -> FloatArray:
-    """Values (..., K) against their mean where there are any; 0 elsewhere."""
+    """Return existing values (..., K) minus their mean, and 0 for missing ones."""
     return centred_rows(values[..., None], there)[..., 0]
 
 
 def centred_rows(values: FloatArray, there: BoolArray) -> FloatArray:
-    """Rows (..., K, n) against their mean over the K where there are any; 0 elsewhere."""
+    """Return existing rows (..., K, n) minus their mean over K, and 0 for missing ones."""
     count = np.maximum(there.sum(axis=-1), 1)[..., None, None]
     known = np.where(there[..., None], values, 0.0)
     return np.asarray(np.where(there[..., None], known - known.sum(axis=-2, keepdims=True) / count, 0.0))

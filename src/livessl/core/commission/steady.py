@@ -1,4 +1,4 @@
-"""Findings with hysteresis: one that comes and goes with single sounds is published once, or not at all."""
+"""Publishes findings with hysteresis, so that a finding does not appear and disappear with single sounds."""
 
 from __future__ import annotations
 

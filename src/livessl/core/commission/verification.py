@@ -1,4 +1,4 @@
-"""The verdict on a set-up by sounds at known places."""
+"""Judges a set-up by sounds at known places."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Final
 from livessl.core.commission.finding import Finding, Severity
 
 LARGE_ERROR_M: Final = 0.3
-"""Error at a known place, in metres, from which a set-up is not right even if nothing explains the error."""
+"""Error at a known place, in metres, from which a set-up counts as wrong even if no finding explains the error."""
 
 
 class SetUpVerdict(StrEnum):
