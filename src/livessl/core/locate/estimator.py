@@ -289,7 +289,7 @@ def _imported(path: str) -> Factory:
         factory: Any = import_module(module)
     except ImportError as error:
         raise ValueError(
-            f"cannot import {module!r} for {path!r} ({error}); install it, or run the command in its folder"
+            f"cannot import {module!r} for {path!r} ({error}); install it, or start in the folder of the module"
         ) from error
     try:
         for name in attribute.split("."):

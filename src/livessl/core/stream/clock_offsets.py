@@ -311,13 +311,15 @@ def _rises(frames: Sequence[Frame]) -> FloatArray:
     frames = frames[: round(MOST_USED_S / FRAME_S)]
     samples = np.concatenate([frame.samples[:_MICROPHONES] for frame in frames], axis=1)
     steps = np.diff(samples, axis=1, prepend=samples[:, :1])  # no rumble
-    pieces = round(FRAME_S / INTERVAL_S)
+    intervals = round(FRAME_S / INTERVAL_S)
     lengths = [frame.samples.shape[1] for frame in frames]
     begins = np.cumsum([0, *lengths[:-1]])
-    edges = np.concatenate([first + np.arange(pieces) * n // pieces for first, n in zip(begins, lengths, strict=True)])
+    edges = np.concatenate(
+        [first + np.arange(intervals) * n // intervals for first, n in zip(begins, lengths, strict=True)]
+    )
     energy = np.add.reduceat(np.square(steps).sum(axis=0, dtype=np.float64), edges)
     power = energy / (len(samples) * np.maximum(1, np.diff(edges, append=samples.shape[1])))
-    floor = max(float(np.median(power[: 2 * pieces])), _LEAST_POWER)
+    floor = max(float(np.median(power[: 2 * intervals])), _LEAST_POWER)
     level = np.log(np.maximum(power, _ABOVE_NOISE * floor))
     decay = np.log(10.0) / 10.0 * _DECAY_DB_S * INTERVAL_S * np.arange(len(level))
     past = np.maximum.accumulate(level + decay) - decay
