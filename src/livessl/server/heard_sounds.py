@@ -1,4 +1,4 @@
-"""The last sounds, each with the delays that the arrays observed; commands and the dashboard calibrate with them."""
+"""Keeps the latest sounds with the delays that the arrays observed, from which set-ups are calibrated."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ KEPT: Final = 64
 
 @dataclass(frozen=True, slots=True)
 class HeardSound:
-    """One sound, and what the arrays observed of it.
+    """One sound, and the observations of the arrays.
 
     Parameters
     ----------
     number : int
         Number of the sound; later sounds have higher ones.
     event : Event
-        Its final event, without `received`.
+        Final event of the sound, without `received`.
     observations : tuple of Observation
     """
 
@@ -35,12 +35,12 @@ class HeardSound:
 class HeardSounds:
     """Keeps the last sounds. The fusion thread calls `take` and `forget`; every thread may read.
 
-    Delays are measured when they are read, so that the fusion thread spends no time on it.
+    Delays are measured when they are read, so that they take no time of the fusion thread.
 
     Parameters
     ----------
     first : int
-        The number after which the numbers of the sounds begin.
+        Number before that of the first sound.
     """
 
     def __init__(self, first: int = 0) -> None:
@@ -54,11 +54,11 @@ class HeardSounds:
 
     @property
     def last(self) -> int:
-        """Number of the last sound; before the first, the number after which they begin."""
+        """Number of the last sound; before the first sound, the number `first`."""
         return self._last
 
     def take(self, event: Event) -> None:
-        """Take in a final event with what the arrays received."""
+        """Take in a final event, with the sound that the arrays received."""
         with self._lock:
             self._last += 1
             self._new.append((self._last, event))
@@ -75,7 +75,7 @@ class HeardSounds:
         return self.read(number)[0]
 
     def read(self, number: int) -> tuple[list[HeardSound], int]:
-        """Return the sounds with a higher number, the oldest first, and the number after which to ask for the next."""
+        """Return the sounds with a higher number, the oldest first, and the number for the next request."""
         self._observe()
         with self._lock:
             return [sound for sound in self._sounds if sound.number > number], self._observed
@@ -95,7 +95,7 @@ class HeardSounds:
         return [known[number] for number in numbers]
 
     def _observe(self) -> None:
-        """Measure the delays of the sounds that are new."""
+        """Measure the delays of new sounds."""
         with self._observing:
             with self._lock:
                 new, run, last = list(self._new), self._run, self._last

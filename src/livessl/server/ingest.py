@@ -17,8 +17,8 @@ ACK_NS: Final = 250_000_000
 """Longest interval, in nanoseconds, between two acknowledgements to a node."""
 
 SOON_NS: Final = 20_000_000
-"""Interval, in nanoseconds, of acknowledgements to a node that sends a backlog or a recording: it sends only a little
-beyond what is acknowledged."""
+"""Interval, in nanoseconds, of acknowledgements to a node that sends a backlog or a recording, because it sends only a
+limited number of frames that are not acknowledged."""
 
 GONE_NS: Final = 2_000_000_000
 """Silence, in nanoseconds, after which another node may take a node's name and arrays."""
@@ -47,11 +47,11 @@ class Peer:
     ended: bool = False
 
     def is_backlog(self, message: Message) -> bool:
-        """Return whether a message is older than what the node calls live."""
+        """Return whether a message is older than the first live frame of the node."""
         return message.array in self.hello.backlog and message.frame_index < self.hello.backlog[message.array][1]
 
     def greet(self, hello: wire.Hello) -> None:
-        """Record the node's backlog: older frames are lost; without one, all frames before live sound have come."""
+        """Record the node's backlog. Older frames are lost; without a backlog, all earlier frames have arrived."""
         for array, (oldest, _) in hello.backlog.items():
             self.received[array] = max(self.received.get(array, oldest - 1), oldest - 1)
         for array in self.live.keys() - hello.backlog.keys():
@@ -59,7 +59,7 @@ class Peer:
         self.hello = hello
 
     def take(self, frame: Frame) -> None:
-        """Record a frame; all earlier frames of the same stream, backlog or live, have come."""
+        """Record a frame. All earlier frames of the same stream, backlog or live, have arrived."""
         waits = frame.array in self.hello.backlog and not self.is_backlog(frame)
         known = self.live if waits else self.received
         known[frame.array] = max(known.get(frame.array, frame.frame_index), frame.frame_index)
@@ -69,8 +69,8 @@ class Peer:
 class Received:
     """The result of one message.
 
-    `joined` is set by a new run, `greeted` by a known run whose backlog changed. `welcome` informs a node of what the
-    server reads, and `offer` that it may request frames; both are sent before the reply.
+    `joined` is set by a new run, `greeted` by a known run whose backlog changed. `welcome` lists the
+    extensions that the server reads, and `offer` announces requests for frames. Both are sent before the reply.
     """
 
     message: Message | None = None
@@ -88,7 +88,7 @@ class Ingest:
     Parameters
     ----------
     site : Site
-        Knows the arrays and the nodes that they belong to.
+        Contains the arrays and their nodes.
     """
 
     def __init__(self, site: Site) -> None:
@@ -108,7 +108,7 @@ class Ingest:
         """Live frames of each array whose samples were dropped because of overload."""
 
     def note_final(self, until: Mapping[str, int]) -> None:
-        """Acknowledge from now on that nodes may delete the frames before these.
+        """Acknowledge from now on that nodes may delete the frames before the given frame indices.
 
         Parameters
         ----------
@@ -118,25 +118,25 @@ class Ingest:
         self._final_until = until
 
     def keep_samples_of(self, arrays: frozenset[str] | None) -> None:
-        """Drop the samples of live frames of all arrays but these from now on; None keeps all.
+        """Drop the samples of live frames of all other arrays from now on; None keeps all samples.
 
-        The rest of such a frame is used: it is acknowledged, and its array takes part in the activity.
+        Such a frame is still acknowledged, and it still counts for the activity.
         """
         self._kept = arrays
 
     def problem_of(self, array: str) -> str | None:
-        """Return what an array's node reports to be wrong with its device, None if nothing is."""
+        """Return the problem that an array's node reports about its device; None without a problem."""
         return next((p.hello.problem for p in self._peers.values() if array in p.hello.arrays and not p.ended), None)
 
     def is_live(self, array: str, now_ns: int) -> bool:
-        """Return whether an array's node has sent anything in the last `NODE_ALIVE_NS`."""
+        """Return whether an array's node has sent any message in the last `NODE_ALIVE_NS`."""
         return any(
             array in peer.hello.arrays and not peer.ended and now_ns - peer.last_ns < NODE_ALIVE_NS
             for peer in self._peers.values()
         )
 
     def receive(self, routing_id: bytes, data: bytes, now_ns: int, enrolled: str | None = None) -> Received:
-        """Take in one message from one peer; `enrolled` is the node whose key it has shown, if the site uses keys."""
+        """Take in one message from one peer; `enrolled` is the node that owns the peer's key, if the site uses keys."""
         try:
             message = wire.decode(data)
         except wire.WireError as error:
@@ -236,7 +236,7 @@ class Ingest:
         return found
 
     def live_nodes(self, now_ns: int) -> list[wire.Hello]:
-        """Return the greetings of the nodes that have sent anything in the last `GONE_NS`."""
+        """Return the greetings of the nodes that have sent any message in the last `GONE_NS`."""
         return [p.hello for p in self._peers.values() if not p.ended and now_ns - p.last_ns < GONE_NS]
 
     def _greet(self, routing_id: bytes, hello: wire.Hello, now_ns: int, enrolled: str | None) -> Received:
@@ -274,7 +274,7 @@ class Ingest:
         return wire.Ack(peer.hello.run_id, dict(peer.received), min(final, default=None))
 
     def _key_fault(self, hello: wire.Hello, enrolled: str | None) -> str | None:
-        """Return why the node may not use this key, which is valid for one node and its arrays; None if it may."""
+        """Return the reason why the node may not use this key, which belongs to one node; None if it may."""
         if enrolled is None:
             return None
         if hello.node != enrolled:

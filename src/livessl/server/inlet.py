@@ -1,4 +1,4 @@
-"""The queue between the nodes' socket and the fusion: bounded in messages and in bytes, and it knows how long it is."""
+"""The queue between the nodes' socket and the fusion. It is bounded in messages and bytes, and measures its delay."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ QUEUE_MESSAGES: Final = 1000
 """Length of the queue: ten seconds of five arrays. While it is full, the socket is not read and nodes keep frames."""
 
 QUEUE_BYTES: Final = 24_000_000
-"""Most bytes in the queue: half a second of 64 arrays of four microphones at 44.1 kHz. More waits with the nodes."""
+"""Most bytes in the queue: half a second of 64 arrays of four microphones at 44.1 kHz. Further frames wait in the
+nodes."""
 
 
 class Inlet(Generic[T]):
@@ -25,7 +26,7 @@ class Inlet(Generic[T]):
     ----------
     clock : Clock
     messages, nbytes : int
-        Limits, beyond which nothing is put in. A single item is always accepted by an empty queue.
+        Limits of the queue. An empty queue always accepts a single item.
     """
 
     def __init__(self, clock: Clock, messages: int = QUEUE_MESSAGES, nbytes: int = QUEUE_BYTES) -> None:
@@ -42,9 +43,9 @@ class Inlet(Generic[T]):
         return len(self._items)
 
     def put(self, items: Sequence[tuple[int, T]], wait_s: float) -> int:
-        """Put items in, each with its bytes, until the queue is full; return how many went in.
+        """Put items with their numbers of bytes into the queue until it is full; return how many were put in.
 
-        If the queue is full already, wait up to `wait_s` for room.
+        If the queue is already full, wait up to `wait_s` for space.
         """
         with self._changed:
             if self._is_full():

@@ -1,7 +1,7 @@
-"""Latency from the sound to a client's socket, by stages, in histograms.
+"""Measures the latency from the sound to a client's socket, by stages, in histograms.
 
-It counts from the earliest moment at which an answer can be known: the end of the window, or, for an event, the end of
-the quiet that ends it. What lies before is not a delay of this system.
+The latency begins at the earliest time at which a result can be known: the end of the window or, for an event, the end
+of the quiet that ends it. Time before that is not a delay of this system.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from livessl.core.types import FRAME_NS, Event, Update
 from livessl.server.api.encode import JsonObject, Stages
 
 KEPT: Final = 1200
-"""Frame indices whose arrival is remembered: one minute."""
+"""Number of frame indices whose arrival is remembered: one minute."""
 
 BUCKETS_S: Final = (
     0.001, 0.002, 0.003, 0.005, 0.0075, 0.01, 0.015, 0.02, 0.025, 0.03, 0.04, 0.05, 0.06, 0.08,
@@ -51,9 +51,9 @@ class Arrivals:
         self._last[frame_index] = arrival
 
     def stages(self, answer: Update | Event, located_ns: int) -> Stages | None:
-        """Return how long each stage took of an answer that was there at site time `located_ns`.
+        """Return the time of each stage for a result that was located at site time `located_ns`.
 
-        None if no arrival is known of the last frame index that the answer needs.
+        Return None if the arrival of the last frame index of the result is not known.
         """
         arrival = self._last.get(answer.complete_ns // FRAME_NS - 1)
         if arrival is None or not arrival.sent_ns:
@@ -68,7 +68,7 @@ class Arrivals:
 
 
 class Latency:
-    """The histograms. Every thread may call it.
+    """The histograms of latency. Every thread may call it.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ class Latency:
         }
 
     def located(self, answer: Update | Event) -> Stages | None:
-        """Count an answer that is there now; return where its time went, None if that is not known."""
+        """Count a result that was located now; return the time of each stage, or None if it is not known."""
         stages = self._arrivals.stages(answer, self._clock.now_ns())
         if stages is not None:
             kind = "event" if isinstance(answer, Event) else "update"
@@ -103,7 +103,7 @@ class Latency:
         return stages
 
     def delivered(self, message: JsonObject, seconds: float) -> None:
-        """Count an answer that a client's socket took `seconds` after it was published."""
+        """Count a result that a client's socket accepted `seconds` after it was published."""
         stages = message["latency_stages_s"]
         self._stages[message["kind"], DELIVERED].observe(seconds)
         self._stages[message["kind"], TOTAL].observe(stages["sent"] + stages["received"] + stages["located"] + seconds)

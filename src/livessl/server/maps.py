@@ -56,11 +56,11 @@ class Picture:
         Site time of the window's middle.
     rows, columns : int
     least, greatest : float
-        The powers that 0 and 255 stand for.
+        Powers that the levels 0 and 255 represent.
     bounds_m : (float, float, float, float)
         Lowest and highest coordinate of the rows, then of the columns.
     levels : bytes
-        One for each grid point, row by row, the first row at the lowest coordinate.
+        One level for each grid point, row by row; the first row has the lowest coordinate.
     """
 
     view: str
@@ -95,7 +95,7 @@ class Picture:
 
 @dataclass(frozen=True, slots=True)
 class Drawn:
-    """The maps of a window, and its pictures by array and view; None for an array that did not detect its sound."""
+    """The maps of a window, and its pictures by array and view; None for an array that did not detect the sound."""
 
     window: Window
     maps: PowerMaps
@@ -116,7 +116,7 @@ class _Watcher:
 
 
 def projection(power: Float32Array, shape: tuple[int, int, int], view: str) -> Float32Array:
-    """Return the largest values along the axis that a view leaves out, (rows, columns); rows go up in y or z."""
+    """Return the largest values (rows, columns) along the axis of a view; y or z increases with the rows."""
     return np.asarray(power.reshape(shape).max(axis=VIEWS[view]).T)
 
 
@@ -147,7 +147,7 @@ class Maps:
         self.failure: BaseException | None = None
         """The error that has ended the thread, if it has ended."""
         self.drawings = 0
-        """Drawings since the start."""
+        """Number of drawings since the start."""
 
     def start(self) -> None:
         """Start the thread."""
@@ -162,7 +162,7 @@ class Maps:
             self._thread.join(timeout=PATIENCE_S)
 
     def show(self, window: Window, draw: Draw) -> None:
-        """Make this the newest window; the thread calls `draw` if a reader or watcher wants it."""
+        """Set the newest window; the thread calls `draw` if a reader or watcher has requested a map."""
         with self._changed:
             self._newest = (window, draw)
             if self._watchers:
@@ -184,9 +184,9 @@ class Maps:
         return len(self._watchers)
 
     def newest(self, array: str) -> Drawn | None:
-        """Wait for the maps of the newest window and return them, an array's own included if it detected the sound.
+        """Wait for the maps of the newest window and return them, including an array's own if it detected the sound.
 
-        Returns None before the first window, and the last drawing after `PATIENCE_S` without a new one.
+        Return None before the first window, and the last drawing if there is no new one within `PATIENCE_S`.
         """
         with self._changed:
             if self._is_missing({array}, set()):
@@ -197,7 +197,7 @@ class Maps:
 
     @contextmanager
     def watching(self, array: str, views: tuple[str, ...], notify: Callable[[], None]) -> Iterator[None]:
-        """Have the pictures of every window drawn while the context lasts; the thread calls `notify` after each."""
+        """Draw the pictures of every window while the context lasts; the thread calls `notify` after each drawing."""
         watcher = _Watcher(array, views, notify)
         with self._changed:
             self._watchers.add(watcher)
@@ -218,7 +218,7 @@ class Maps:
             raise
 
     def _wait_until_wanted(self) -> bool:
-        """Wait until there is something to draw and it is time; return false if the thread shall end."""
+        """Wait until a drawing is requested and due; return False if the thread must end."""
         with self._changed:
             self._changed.wait_for(lambda: self._stopping or self._is_missing(*self._wanted()))
             pause_s = (self._drawn_ns + INTERVAL_NS - self._clock.monotonic_ns()) / 1e9
@@ -227,12 +227,12 @@ class Maps:
             return not self._stopping
 
     def _wanted(self) -> tuple[set[str], set[tuple[str, str]]]:
-        """Return the arrays whose maps, and the pictures, that readers or watchers want."""
+        """Return the arrays whose maps are requested, and the requested pictures."""
         pictures = {(watcher.array, view) for watcher in self._watchers for view in watcher.views}
         return self._requested | {array for array, _ in pictures}, pictures
 
     def _is_missing(self, arrays: set[str], pictures: set[tuple[str, str]]) -> bool:
-        """Return whether any of these could be drawn and is not."""
+        """Return whether any requested map or picture could be drawn but is not yet drawn."""
         if self._newest is None or not arrays:
             return False
         drawn = self._drawn

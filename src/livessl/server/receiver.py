@@ -87,11 +87,11 @@ Item = Message | Joined | Greeted | Left
 
 
 class Inbox(Protocol):
-    """The origin of the nodes' messages: a `Receiver`, or its stand-in in a simulation."""
+    """Source of the nodes' messages: a `Receiver`, or a replacement in a simulation."""
 
     @property
     def ingest(self) -> Ingest:
-        """The protocol, which knows the connected nodes."""
+        """The protocol with the nodes, which keeps the list of connected nodes."""
         ...
 
     @property
@@ -111,7 +111,7 @@ class Inbox(Protocol):
 
     @property
     def endpoint(self) -> str:
-        """The address that nodes connect to."""
+        """The address to which nodes connect."""
         ...
 
     @property
@@ -142,7 +142,7 @@ class Inbox(Protocol):
 
 
 class Receiver:
-    """The ROUTER socket and its thread.
+    """Receives the messages of all nodes on a ZeroMQ ROUTER socket, on its own thread.
 
     Parameters
     ----------
@@ -256,7 +256,7 @@ class Receiver:
         return more
 
     def _take_in(self, routing_id: bytes, data: bytes, enrolled: str | None, read: list[tuple[int, Item]]) -> None:
-        """Take in one message; add what the fusion gets of it to `read`, each with its bytes."""
+        """Take in one message; add the resulting items for the fusion to `read`, each with its number of bytes."""
         received = self.ingest.receive(routing_id, data, self._clock.monotonic_ns(), enrolled)
         if received.joined is not None:
             read.append((0, Joined(received.joined)))

@@ -9,11 +9,11 @@ from contextlib import contextmanager
 from typing import Final, NamedTuple
 
 KEPT_LINES: Final = 1000
-"""Most lines that are kept: days of a server without trouble, and the beginning of most troubles."""
+"""Largest number of lines that are kept: days of a server without faults, and the beginning of most faults."""
 
 MAX_LINE: Final = 2000
-"""Longest message that is kept, in characters, so that the lines take 10 MB at most. Of longer ones beginning and end
-are: a traceback says at its end what is wrong."""
+"""Longest message that is kept, in characters, so that the lines take at most 10 MB. The middle of longer messages is
+cut, because the end of a traceback names the error."""
 
 
 class Line(NamedTuple):
@@ -63,7 +63,7 @@ class RecentLog(logging.Handler):
 
 
 def _shortened(message: str) -> str:
-    """Return beginning and end of a long message, with what is left out between them."""
+    """Return the beginning and end of a long message, with the number of characters that were cut."""
     if len(message) <= MAX_LINE:
         return message
     note = f"\n… {len(message) - MAX_LINE + 100} characters are left out …\n"

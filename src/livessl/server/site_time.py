@@ -1,4 +1,4 @@
-"""Site time and where it comes from: the machine's clock in a live run, the recording in a replay."""
+"""Keeps site time, which comes from the machine's clock in a live run, and from the recording in a replay."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class SiteTime:
 
     @property
     def mode(self) -> Literal["live", "replay"]:
-        """`replay` from the first node of a recorded session on, until a live node joins; else `live`."""
+        """`replay` from the first node of a recorded session until a live node joins; otherwise `live`."""
         return "live" if self._replayed_ns is None else "replay"
 
     @property
@@ -63,7 +63,7 @@ class SiteTime:
         self.note_sound()
 
     def end_replay(self) -> None:
-        """Expect no more sound of the recording; site time stays at its end."""
+        """End the replay; site time stays at the end of the recording."""
         self.replay_is_running = False
 
     def advance(self, messages: Iterable[Message]) -> None:
@@ -73,9 +73,9 @@ class SiteTime:
             self._replayed_ns = max(self._replayed_ns, *ends_ns, 0)
 
     def note_sound(self) -> None:
-        """Note that messages have just come."""
+        """Note that messages have just arrived."""
         self._last_sound_ns = self._clock.monotonic_ns()
 
     def replay_is_silent(self) -> bool:
-        """Return whether a replay is running that has sent nothing for `REPLAY_SILENT_NS`."""
+        """Return whether a replay is running that has sent no messages for `REPLAY_SILENT_NS`."""
         return self.replay_is_running and self._clock.monotonic_ns() - self._last_sound_ns > REPLAY_SILENT_NS

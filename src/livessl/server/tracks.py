@@ -1,4 +1,4 @@
-"""Tracks that are alive, as they were last published."""
+"""Keeps the latest published state of all tracks that have not ended."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ class Tracks:
     Parameters
     ----------
     presence : Presence
-        Follows the same tracks through the zones.
+        Receives the same tracks, to follow them through the zones.
     trails : Trails
-        Puts the same tracks into the journal.
+        Receives the same tracks, to write them into the journal.
     """
 
     def __init__(self, presence: Presence, trails: Trails) -> None:

@@ -1,4 +1,4 @@
-"""Follows each track to its end, and puts it into the journal: when, how long, where, and through which zones."""
+"""Writes each track that has ended into the journal: its time, length, path, and zones."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from livessl.server.api.encode import JsonObject
 from livessl.server.journal import Journal
 
 MAX_POINTS: Final = 200
-"""Most points that are kept of a track; beyond it every second one is dropped, again and again."""
+"""Largest number of points that are kept for a track. At this number, every second point is dropped."""
 
 NS_PER_S: Final = 1_000_000_000
 
@@ -42,7 +42,7 @@ class _Trail:
 
 
 class Trails:
-    """Follows the tracks of live runs. For the fusion thread.
+    """Follows the tracks of live runs. Only the fusion thread may call it.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ class Trails:
         self._live: dict[int, _Trail] = {}
 
     def take(self, track: Track, message: JsonObject) -> None:
-        """Take in the new state of a track, and the message that was made of it."""
+        """Take in the new state of a track, and the message that describes it."""
         if track.state is TrackState.END:
             self._end(track.id)
         elif not self._is_replay():
@@ -66,7 +66,7 @@ class Trails:
             trail.take(track, message)
 
     def end_all(self) -> None:
-        """Let every track end: a run has ended."""
+        """End every track, because a run has ended."""
         for number in list(self._live):
             self._end(number)
 
