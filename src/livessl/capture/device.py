@@ -1,4 +1,4 @@
-"""The protocol of audio devices: what a capture node needs of a device, whichever library drives the device."""
+"""The protocol of audio devices, which a capture node uses whatever library drives the device."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The node's end of one run of the process that owns its device: its blocks, its reports, its output, and its end."""
+"""Starts and ends the process that owns a node's device, and reads its blocks, reports and output."""
 
 from __future__ import annotations
 
@@ -17,31 +17,31 @@ from livessl.capture.ring import RingReader, beyond_standard
 from livessl.core.types import Block
 
 OUTPUT_BYTES: Final = 65536
-"""Most output of native libraries that is read at once, in bytes. It is the size of a pipe: a library that prints more
-waits until the node has read it."""
+"""Most output of native libraries, in bytes, that is read at one time. It is the size of a pipe, so a library that
+prints more waits until the node has read it."""
 
 ENDING_S: Final = 0.5
-"""Time in seconds in which the process may end by itself; then it is killed."""
+"""Time, in seconds, that the process may take to end before it is killed."""
 
 PROGRAM: Final = (sys.executable, "-P", "-m", "livessl.capture.device_main")
 """The program that owns the device."""
 
 
 class DamageError(Exception):
-    """The process has written something into the ring or its reports that it never writes: its memory is damaged."""
+    """The process has written invalid data into the ring or its reports, because its memory is damaged."""
 
 
 class DeviceProcess:
-    """One run of the process that owns the device. It begins with the object.
+    """One run of the process that owns the device. The process starts when the object is created.
 
     Parameters
     ----------
     wanted : Wanted
         The device.
     program : sequence of str
-        The program and its arguments; it gets the device and its file descriptors as two more.
+        The program and its arguments. The device and its file descriptors are added as two further arguments.
     environment : mapping or None
-        Its environment variables; None for those of this process.
+        Environment variables of the process; None for those of this process.
     """
 
     def __init__(
@@ -83,7 +83,7 @@ class DeviceProcess:
 
     @property
     def waiting(self) -> int:
-        """Number of blocks that `block` returns without a wait."""
+        """Number of blocks that `block` returns without waiting."""
         return self._ring.waiting
 
     @property
@@ -98,7 +98,7 @@ class DeviceProcess:
 
     @property
     def beats(self) -> int:
-        """Turns of the process's main loop."""
+        """Number of passes of the process's main loop."""
         return self._ring.beats
 
     @property
@@ -112,7 +112,7 @@ class DeviceProcess:
         return self._process.pid
 
     def wait(self, seconds: float) -> None:
-        """Return when the process has published a block or a report, or has ended, or after some seconds."""
+        """Wait until the process has published a block or a report, or has ended, or until some seconds have passed."""
         if not self._ring.waiting:
             for fd, events in self._poll.poll(seconds * 1e3):
                 if fd == self._reports_fd and events & select.POLLHUP and not events & select.POLLIN:
@@ -122,7 +122,7 @@ class DeviceProcess:
             self._ring.receive()
 
     def block(self) -> Block | None:
-        """Return the next block, with samples (channels, n) of its own; None if none is there.
+        """Return the next block, with its own copy of the samples (channels, n); None if there is no block.
 
         Raises
         ------
@@ -143,7 +143,7 @@ class DeviceProcess:
         return Block(slot.first_index, own, slot.time_ns, slot.lost)
 
     def reports(self) -> list[Report]:
-        """Return the reports that have come since the last call.
+        """Return the reports that have arrived since the last call.
 
         Raises
         ------
@@ -157,7 +157,7 @@ class DeviceProcess:
             raise DamageError(f"report: {error}") from error
 
     def output(self) -> bytes:
-        """Return what native libraries have printed since the last call, at most `OUTPUT_BYTES`."""
+        """Return the output of native libraries since the last call, at most `OUTPUT_BYTES`."""
         return self._read(self._output_fd)
 
     def end(self, *, kill: bool) -> bytes:

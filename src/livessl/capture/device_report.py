@@ -1,6 +1,6 @@
-"""The request to the process that owns a device, and the reports of that process, as JSON.
+"""Encodes as JSON the request to the process that owns a device, and the reports of that process.
 
-The standard library is enough for this module, because the device process loads as little as possible.
+This module uses only the standard library, because the device process imports as little as possible.
 """
 
 from __future__ import annotations
@@ -14,21 +14,21 @@ from livessl.capture.ring import RingShape
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """The device that is wanted.
+    """The requested device.
 
     Parameters
     ----------
     name : str
         Name, part of it, or `HOSTAPI: part of the name`.
     channels : int
-        Channels to record, from the first on.
+        Number of channels to record, counted from the first channel.
     sample_rate_hz : float
     block_samples : int
         Samples per channel of one block.
     latency_s : float
         Latency requested from the driver, in seconds: the size of its buffer.
     slots : int
-        Blocks in the ring.
+        Number of blocks in the ring.
     serial : str or None
         Serial number of the USB device; None if any will do.
     usb_port : str or None
@@ -46,7 +46,7 @@ class Wanted:
 
     @property
     def ring(self) -> RingShape:
-        """The ring that its blocks need."""
+        """Shape of the ring for the blocks of the device."""
         return RingShape(self.channels, self.block_samples, self.slots)
 
     def to_json(self) -> str:
@@ -69,11 +69,11 @@ class DeviceState(StrEnum):
     BUSY = "busy"
     """Another program holds the device."""
     UNSUITABLE = "unsuitable"
-    """Waiting does not help: wrong rate, too few channels, an ambiguous name, no PortAudio."""
+    """The device cannot be used even later: wrong rate, too few channels, an ambiguous name, or no PortAudio."""
     FAILED = "failed"
     """The device cannot be opened for another reason."""
     STOPPED = "stopped"
-    """The stream has ended; the process ends, too."""
+    """The stream has ended; the process ends as well."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +88,7 @@ class Report:
     hardware : bool
         Whether samples come directly from the device, not through a sound server.
     not_realtime : str
-        Why the process has no real-time scheduling or no locked memory; empty if it has both.
+        Reason why the process has no real-time scheduling or no locked memory; empty if it has both.
     """
 
     state: DeviceState
@@ -114,7 +114,7 @@ class OpeningError(Exception):
     ----------
     state : DeviceState
     message : str
-        What, expected, got, cure.
+        Words for the problem: what, expected, got, cure.
     """
 
     def __init__(self, state: DeviceState, message: str) -> None:

@@ -1,4 +1,4 @@
-"""One run of the process that owns an audio device, and what the node sees of it: what `device_watch` judges."""
+"""Collects the observations of one run of the device process, by which `device_watch` judges the process."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ WAIT_S: Final = 0.25
 """Longest wait of the iterator, in seconds, so that the caller can serve its network link in between."""
 
 OUTPUT_S: Final = 0.2
-"""Shortest interval between two looks at the output of native libraries, in seconds. Each look reads at most 64 kB, so
-that a library that prints without end waits."""
+"""Shortest interval, in seconds, at which the output of native libraries is read. At most 64 kB are read at one time,
+so that a library that prints endlessly has to wait."""
 
 FLOOD_BYTES: Final = 32768
-"""Output of native libraries between two looks, in bytes, that counts as a flood: 160 kB in a second."""
+"""Output of native libraries in one interval, in bytes, that counts as a flood: 160 kB per second."""
 
 
 class DeviceRun:
-    """Wraps one run of the process, from its start to its end.
+    """Observes one run of the process, from its start to its end.
 
     Parameters
     ----------
     process : DeviceProcess
     clock : Clock
-        For waits, and for the interval at which output is read.
+        Clock for waits and for the interval at which output is read.
 
     Attributes
     ----------
@@ -53,7 +53,7 @@ class DeviceRun:
         self._output_ns = clock.monotonic_ns()
 
     def wait(self) -> None:
-        """Wait for something new. Time in which this process did not run is not counted as the other's."""
+        """Wait for a block or a report. Time in which the node itself did not run does not count for the process."""
         begun_ns = self._clock.monotonic_ns()
         self.process.wait(WAIT_S)
         waited_s = min(WAIT_S, (self._clock.monotonic_ns() - begun_ns) / 1e9)
@@ -83,7 +83,7 @@ class DeviceRun:
         return reports
 
     def new_overruns(self) -> int:
-        """Return the number of blocks that the ring had no room for since the last call."""
+        """Return the number of blocks, since the last call, for which the ring had no space."""
         before, self._overruns = self._overruns, self.process.overruns
         return self._overruns - before
 
@@ -93,7 +93,7 @@ class DeviceRun:
         return self._counted_flagged - before
 
     def read_output(self, output: NativeOutput) -> None:
-        """Read a limited amount of what native libraries print."""
+        """Read a limited amount of the output of native libraries."""
         now_ns = self._clock.monotonic_ns()
         if now_ns - self._output_ns < OUTPUT_S * 1e9:
             return
@@ -103,7 +103,7 @@ class DeviceRun:
         self._floods = self._floods + 1 if len(printed) >= FLOOD_BYTES else 0
 
     def seen(self, *, delivered_before: bool) -> Seen:
-        """Return what the node sees of the process."""
+        """Return the node's observations of the process."""
         return Seen(
             self.report,
             delivered=self.delivers,

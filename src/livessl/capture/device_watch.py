@@ -1,4 +1,4 @@
-"""Judges whether the process that owns a device still works, from what the node sees of it. It reads no clock."""
+"""Judges from the node's observations whether the process that owns a device still works. It reads no clock."""
 
 from __future__ import annotations
 
@@ -13,32 +13,33 @@ START_NOTICE_S: Final = 1.5
 """Time, in seconds, without a first report after which the problem mentions that there is none."""
 
 START_S: Final = 15.0
-"""Time in seconds that the process may take until its first report; slow machines load the library for seconds."""
+"""Time, in seconds, that the process may take until its first report; slow machines load the library for seconds."""
 
 STALLED_S: Final = 1.0
-"""Time without a block, in seconds, after which a stream that has delivered is given up."""
+"""Time, in seconds, without a block after which a stream that has delivered before counts as stalled."""
 
 FIRST_BLOCK_S: Final = 1.5
-"""Time in seconds in which a device that was opened must deliver its first block."""
+"""Time, in seconds, within which an opened device must deliver its first block."""
 
 FIRST_BLOCK_OF_SERVER_S: Final = 4.0
-"""Time in seconds in which a sound server that was opened must deliver its first block; it may take 2 s to begin."""
+"""Time, in seconds, within which an opened sound server must deliver its first block; it may take 2 s to begin."""
 
 HUNG_S: Final = 2.0
-"""Time in seconds without a sign of life after which a process with an open stream is killed."""
+"""Time, in seconds, without a sign of life after which a process with an open stream is killed."""
 
 SCAN_S: Final = 5.0
-"""Time in seconds without a sign of life after which a process that looks for the device is killed: a scan of all
+"""Time, in seconds, without a sign of life after which a process that searches for the device is killed. A scan of all
 devices gives no sign of life and may take a second."""
 
 LAGGING_S: Final = 5.0
-"""Time without a block, in seconds, after which a stream is given up although the machine is too busy to run it."""
+"""Time, in seconds, without a block after which a stream counts as stalled even if the machine is too busy to run
+it."""
 
 FLOODS: Final = 3
-"""Number of looks in a row that find a flood of native output before the library is taken to loop."""
+"""Number of consecutive intervals with a flood of native output after which the library counts as looping."""
 
 BEATS_PER_S: Final = 10
-"""Signs of life that a process gives in a second if the machine lets it run."""
+"""Number of signs of life per second of a process that the machine lets run."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,25 +49,25 @@ class Seen:
     Parameters
     ----------
     report : Report or None
-        Its last report.
+        Last report of the process.
     delivered : bool
         Whether this run has delivered a block.
     delivered_before : bool
         Whether an earlier run has delivered a block.
     idle_s : float
-        Time since the last block, or since the last report if that came later, in seconds.
+        Time since the last block, or since the last report if it is later, in seconds.
     beats : int
-        Signs of life in that time.
+        Number of signs of life in the idle time.
     silent_s : float
         Time since the last sign of life, in seconds.
     flagged : int
-        Blocks in that time that were dropped because the driver flagged a loss in them.
+        Number of blocks in the idle time that were dropped because the driver flagged a loss in them.
     unflagged_s : float
-        Time since the last such block, in seconds.
+        Time since the last flagged block, in seconds.
     floods : int
-        Number of looks in a row that found a flood of output.
+        Number of consecutive intervals with a flood of output.
     exit_code : int or None
-        Its exit code; None while it runs.
+        Exit code of the process; None while it runs.
     """
 
     report: Report | None
@@ -90,7 +91,7 @@ class Verdict:
     problem : str
         The problem in words.
     over : bool
-        Whether the process is to be ended and started again.
+        Whether the process has to be ended and started again.
     """
 
     problem: str

@@ -1,6 +1,7 @@
-"""The capture devices that the Linux kernel lists: names, USB ports, serial numbers, and the programs that hold them.
+"""Reads the kernel's list of capture devices: names, USB ports, serial numbers, and the programs that use them.
 
-PortAudio hides a device that another program holds. The kernel's lists distinguish it from one that is not connected.
+PortAudio hides a device that another program uses. The kernel's list distinguishes it from a device that is not
+connected.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ class HardwareInput:
     device : int
         Numbers of card and device, as in `hw:CARD,DEVICE`. They change when interfaces are plugged in again.
     name : str
-        PortAudio's name of it.
+        PortAudio's name of the device.
     usb_port : str or None
         USB port, such as `usb-0000:00:14.0-2`; None if it is not on USB.
     serial : str or None
@@ -42,7 +43,7 @@ class HardwareInput:
 
     @property
     def holder(self) -> str | None:
-        """The program that records from it, `NAME (process ID)`; None if there is none or it is not known."""
+        """The program that records from the device, `NAME (process ID)`; None if there is none, or it is unknown."""
         status = _read(_ASOUND / f"card{self.card}/pcm{self.device}c/sub0/status")
         owner = _OWNER.search(status)
         if owner is None:
@@ -72,7 +73,7 @@ def hardware_inputs() -> list[HardwareInput]:
 
 
 def _read(path: Path) -> str:
-    """Return a file's text; none if it cannot be read, because devices come and go."""
+    """Return a file's text; empty if it cannot be read, because devices can disappear."""
     try:
         return path.read_text(encoding="utf-8", errors="replace")
     except OSError:

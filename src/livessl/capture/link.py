@@ -1,7 +1,7 @@
 """A node's link to the server: greeting, acknowledgements and reconnection. It never blocks.
 
-Live sound goes first. Kept frames follow in order of time in the remaining bandwidth, only a few frames beyond the last
-acknowledgement.
+Live sound is sent first. Kept frames follow in order of time in the remaining bandwidth, with only a few frames that
+are not acknowledged.
 """
 
 from __future__ import annotations
@@ -21,20 +21,21 @@ from livessl.site.keys import NodeKeys
 from livessl.traces import traces_in_use
 
 HELLO_NS: Final = 1_000_000_000
-"""Interval of greetings, in ns, while the server does not answer, or while there is nothing else to send."""
+"""Interval of greetings, in nanoseconds, while the server does not answer, or while there is nothing else to send."""
 
 SILENT_NS: Final = 2_000_000_000
-"""Silence of the server, in ns, after which it is taken to be gone; it acknowledges four times a second."""
+"""Silence of the server, in nanoseconds, after which it counts as unreachable; it acknowledges four times a second."""
 
 CONNECT_TIMEOUT_NS: Final = 10_000_000_000
-"""Longest wait of `wait_connected`, in ns. A replay gives up after it, because a person is waiting."""
+"""Longest wait of `wait_connected`, in nanoseconds. A replay then gives up, because a person is waiting."""
 
 _BYE_TRIES: Final = 25
 _BYE_WAIT_MS: Final = 20
-"""Tries to send the last sound and a good-bye, and the wait between them in ms: half a second in all."""
+"""Number of attempts to send the last sound and a good-bye, and the wait between them in milliseconds: half a second in
+all."""
 
 _BYE_LINGER_MS: Final = 500
-"""Time in ms that the operating system has to send a good-bye that was handed over."""
+"""Time, in milliseconds, that the operating system has to send a good-bye."""
 
 _log = logging.getLogger(__name__)
 
@@ -42,8 +43,8 @@ _log = logging.getLogger(__name__)
 class Link:
     """Connection of a node to the server over which no frame is lost while the spool has room.
 
-    Frames stay in the spool until the server needs them no more; after an interruption, those that it has not received
-    are sent again.
+    Frames stay in the spool until the server no longer needs them. After an interruption, frames that the server has
+    not received are sent again.
 
     Parameters
     ----------
@@ -55,7 +56,7 @@ class Link:
     keys : NodeKeys or None
         The node's own keys and the server's public key; None if the site uses no keys.
     spool : Spool or None
-        Holds the frames; None for one in memory. It is closed with the link.
+        Store of the frames; None for a spool in memory. It is closed with the link.
     dealer : Dealer or None
         The connection; None for a new one.
     backfill : callable or None
@@ -91,7 +92,7 @@ class Link:
 
     @property
     def connected(self) -> bool:
-        """True if the server has accepted the node, and has acknowledged something within `SILENT_NS`."""
+        """True if the server has accepted the node, and has sent an acknowledgement within `SILENT_NS`."""
         return self._accepted and self._clock.monotonic_ns() - self._answered_ns < SILENT_NS
 
     @property
@@ -111,7 +112,7 @@ class Link:
 
     @property
     def settled(self) -> int | None:
-        """Frame index before which the server needs nothing more; None as long as it has not reported one."""
+        """Frame index before which the server needs no frames; None as long as the server has not reported one."""
         return self._outbox.settled
 
     @property
@@ -120,20 +121,20 @@ class Link:
         return len(self._spool)
 
     def report(self, problem: str | None) -> None:
-        """Report a problem of the device to the server; None reports that it is over."""
+        """Report a problem of the device to the server; None reports that the problem is over."""
         if problem != self._hello.problem:
             self._hello = replace(self._hello, problem=problem)
             self._hello_due = True
             self.service()
 
     def send(self, messages: Iterable[Message]) -> None:
-        """Queue messages, and send as many as the connection takes."""
+        """Queue messages, and send as many as the connection accepts."""
         for message in messages:
             self._outbox.add(message, self._clock.monotonic_ns(), connected=self._accepted)
         self.service()
 
     def service(self) -> None:
-        """Read acknowledgements, greet if necessary, and send as many messages as the connection takes."""
+        """Read acknowledgements, greet if necessary, and send as many messages as the connection accepts."""
         self._receive()
         if self._dealer.broken() and self._accepted:
             _log.info("the connection to the server at %s broke; unacknowledged frames are sent again", self.endpoint)
@@ -151,7 +152,7 @@ class Link:
             self._fall_behind()
 
     def wait_connected(self, stop: Callable[[], bool]) -> None:
-        """Return when the server has accepted or refused the node, on `stop`, or after `CONNECT_TIMEOUT_NS`."""
+        """Wait until the server has accepted or refused the node, at most `CONNECT_TIMEOUT_NS` or until `stop`."""
         while not (self.connected or self.refused or stop()):
             if self._clock.monotonic_ns() - self._begun_ns > CONNECT_TIMEOUT_NS:
                 return
@@ -159,13 +160,13 @@ class Link:
             self._dealer.wait(20)
 
     def close(self, *, bye: bool) -> None:
-        """Close the connection and the spool; with `bye` the server knows that the node ends on purpose."""
+        """Close the connection and the spool; with `bye` the server is informed that the node ends on purpose."""
         said = bye and self._say_bye()
         self._dealer.close(_BYE_LINGER_MS if said else 0)
         self._spool.close()
 
     def _seek(self, now_ns: int) -> None:
-        """Greet a server that does not answer, and log that once."""
+        """Greet a server that does not answer, and log once that it does not."""
         if self._accepted:
             _log.warning("server at %s unreachable; buffering and retrying", self.endpoint)
             self._disconnect()
@@ -250,7 +251,7 @@ class Link:
         self._traces.frame_sent(array, frame_index, (frame_index + 1) * FRAME_NS, self._clock.now_ns())
 
     def _disconnect(self) -> None:
-        """Expect nothing from the connection: unacknowledged frames are sent again when the server answers."""
+        """Treat the connection as lost; unacknowledged frames are sent again when the server answers."""
         self._accepted = False
         self._outbox.disconnected()
         self._outbox.send_sections(False)
@@ -263,7 +264,7 @@ class Link:
             self._hello_ns = self._clock.monotonic_ns()
 
     def _say_bye(self) -> bool:
-        """Send a good-bye after the last live sound, which may have to wait for room; return True if it was sent."""
+        """Send a good-bye after the last live sound, which may have to wait for space; return True if it was sent."""
         farewell = wire.encode(wire.Bye(self._hello.node, self._hello.run_id))
         for _ in range(_BYE_TRIES):
             if not self._outbox.has_live and self._try_send(farewell):
@@ -275,7 +276,7 @@ class Link:
         return self._try_send(farewell)
 
     def _try_send(self, data: bytes) -> bool:
-        """Return True if the message was handed over, stamped with the present time."""
+        """Stamp a message with the present time and send it; return True if the connection accepted it."""
         if not self._dealer.send(wire.stamped(data, self._clock.now_ns())):
             return False
         self._sent_ns = self._clock.monotonic_ns()

@@ -1,4 +1,4 @@
-"""Counts the sound of a device that is lost because this machine does not keep up. It knows no process."""
+"""Counts the sound of a device that is lost because the machine does not keep up. It knows no process."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from livessl.clock import Clock
 from livessl.core.types import Block
 
 LAG_SHOWN_NS: Final = 5_000_000_000
-"""Time in ns for which blocks that were not read in time stay the problem of the device."""
+"""Time, in nanoseconds, for which blocks that were not read in time are reported as a problem of the device."""
 
 _log = logging.getLogger(__name__)
 
@@ -27,17 +27,17 @@ class LossCount:
     block_s : float
         Length of a block, in seconds.
     clock : Clock
-        Measures how long ago blocks were lost.
+        Clock that measures how long ago blocks were lost.
 
     Attributes
     ----------
     lost_blocks : int
-        Blocks that were lost: those that the driver flagged, those that this process did not read in time, and one for
+        Number of lost blocks: those that the driver flagged, those that this process did not read in time, and one for
         each gap without a flag.
     overruns : int
         Lost blocks that this process did not read in time.
     unflagged_gaps : int
-        Gaps that no driver flagged.
+        Number of gaps that the driver did not flag.
     """
 
     def __init__(self, name: str, sample_rate_hz: float, block_s: float, clock: Clock) -> None:
@@ -52,11 +52,11 @@ class LossCount:
         self._gaps = GapWatch(sample_rate_hz, block_s, SOUND_SERVER)
 
     def begin(self, *, hardware: bool) -> None:
-        """Search for gaps by the rule for hardware, or for a sound server, from the next block on."""
+        """From the next block on, search for gaps by the rule for hardware, or by that for a sound server."""
         self._gaps = GapWatch(self._sample_rate_hz, self._block_s, HARDWARE if hardware else SOUND_SERVER)
 
     def is_after_gap(self, block: Block) -> bool:
-        """Return True if sound is missing before a block, and the driver has not flagged that."""
+        """Return True if sound is missing before a block, and the driver has not flagged the gap."""
         if block.overflow:
             self._gaps.restart()
         gap_ns = self._gaps.push(block.first_index, block.stamp_ns)
@@ -82,7 +82,7 @@ class LossCount:
 
     @property
     def problem(self) -> str | None:
-        """A problem in words while blocks were lost lately because this process did not read them in time."""
+        """The problem in words if this process has recently not read blocks in time; otherwise None."""
         now_ns = self._clock.monotonic_ns()
         if self._lag_ns is None or now_ns - self._lag_ns > LAG_SHOWN_NS:
             return None

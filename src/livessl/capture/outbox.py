@@ -48,16 +48,16 @@ class Outbox:
     Parameters
     ----------
     spool : Spool
-        Holds the frames. Frames that are in the spool already are the first backlog.
+        Store of the frames. Frames that are already in the spool are the first backlog.
     on_sent : callable or None
-        Gets the array and the frame index of every frame that was handed over.
+        Called with the array and the frame index of every frame that was sent.
 
     Attributes
     ----------
     dropped : int
-        Frames that were lost before the server got them.
+        Number of frames that were lost before the server received them.
     settled : int or None
-        Frame index before which the server needs nothing more, by its last acknowledgement.
+        Frame index before which the server needs no frames, by its last acknowledgement.
     """
 
     def __init__(self, spool: Spool, on_sent: Callable[[str, int], None] | None = None) -> None:
@@ -96,7 +96,7 @@ class Outbox:
         return bool(self._live) and now_ns - self._live[0][0] >= LATE_NS
 
     def backlog_spans(self) -> dict[str, tuple[int, int]]:
-        """Return for each array of the backlog the frame index of its first frame, and the one after its last."""
+        """Return for each array of the backlog the frame index of its first frame, and the one after its last frame."""
         spans: dict[str, tuple[int, int]] = {}
         for kept in (*self._backlog_sent, *self._backlog):
             spans[kept.array] = (spans.get(kept.array, (kept.frame_index, 0))[0], kept.frame_index + 1)
@@ -116,11 +116,11 @@ class Outbox:
         self._with_sections = allowed
 
     def add_requested(self, messages: Iterable[Message]) -> None:
-        """Queue the answer to a backfill request. It bypasses the spool, and if it gets lost it is not sent again."""
+        """Queue the answer to a backfill request. It bypasses the spool, and is not sent again if it is lost."""
         self._requested.extend(messages)
 
     def acknowledge(self, received: Mapping[str, int], settled: int | None) -> None:
-        """Forget frames that the server has received; release those that the server needs no more from the spool."""
+        """Forget frames that the server has received; release frames that it no longer needs from the spool."""
         self._received, self.settled = received, settled
         for array, last in received.items():
             if settled is not None:
@@ -134,7 +134,7 @@ class Outbox:
         self._backlog = deque(kept for kept in frames if not self._is_received(kept))
 
     def disconnected(self) -> None:
-        """Replace the backlog by all frames in the spool: whatever was on its way may be lost."""
+        """Replace the backlog by all frames in the spool, because frames in transit may be lost."""
         self._received = {}
         self._keep_newest_marks(self._live)
         for queue in (self._live, self._live_sent, self._backlog_sent, self._requested):
@@ -148,12 +148,12 @@ class Outbox:
         self._keep_newest_marks(waiting)
 
     def queue_marks(self, now_ns: int) -> None:
-        """Queue the newest marks, which waited for the server, as live."""
+        """Queue the newest marks, which waited for the server, as live messages."""
         self._live.extend((now_ns, mark) for mark in self._newest_marks.values())
         self._newest_marks.clear()
 
     def send(self, send: Send, now_ns: int) -> bool:
-        """Send live sound first, then requested frames, then the backlog; return False when `send` finds no room."""
+        """Send live sound first, then requested frames, then the backlog; return False if `send` accepts no more."""
         while self._live:
             first = self._live[0][1]
             if not self._send_one(first, send):
@@ -175,7 +175,7 @@ class Outbox:
         return True
 
     def _send_one(self, message: Kept | Mark, send: Send) -> bool:
-        """Return True if the message was handed over, or cannot be read any more."""
+        """Send a message; return True if it was sent, or can no longer be read."""
         if isinstance(message, Mark):
             mark = replace(message, lost_frames=message.lost_frames + self.dropped)
             return send(
@@ -207,7 +207,7 @@ class Outbox:
             self._drop(removed)
 
     def _drop(self, removed: Sequence[Kept]) -> None:
-        """Remove frames for which the spool had no room from all queues; count those that the server never got."""
+        """Remove frames for which the spool had no space from all queues; count those the server never received."""
         lost = [kept for kept in removed if not self._is_received(kept)]
         self._live = deque(waiting for waiting in self._live if waiting[1] not in lost)
         for kept in lost:
@@ -222,7 +222,7 @@ class Outbox:
         return kept.array in self._received and kept.frame_index <= self._received[kept.array]
 
     def _keep_newest_marks(self, waiting: Iterable[tuple[int, Kept | Mark]]) -> None:
-        """Keep the last mark of each array, unless a frame follows it: then the mark is out of date."""
+        """Keep the last mark of each array, unless a frame follows it, which makes the mark obsolete."""
         newest: dict[str, Mark] = {}
         for _, message in waiting:
             if isinstance(message, Mark):

@@ -1,4 +1,4 @@
-"""Recordings that a node plays in place of an audio interface: files, or a simulated scene."""
+"""Makes the recordings that a node plays in place of an audio interface: files, or a simulated scene."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def node_recordings(
     Raises
     ------
     DeviceError
-        One line for each file that does not fit; or why the scene cannot be simulated.
+        If files do not fit (one line for each), or the scene cannot be simulated.
     """
     config = site.nodes[node].device
     arrays = site.nodes[node].arrays

@@ -1,7 +1,7 @@
-"""Audio inputs through PortAudio: their list, the search by name, and the opening of one.
+"""Lists the audio inputs of PortAudio, finds one by name, and opens it.
 
-Only this module imports `sounddevice`. It does so where it uses the library, so that everything else works on a machine
-without PortAudio. The library runs in a process of its own (see `device_main`), without numpy.
+Only this module imports `sounddevice`. The import is inside functions, so that all other commands work on a machine
+without PortAudio. The library runs in a separate process (see `device_main`), without numpy.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from livessl.capture.hardware import HardwareInput, hardware_inputs
 from livessl.errors import DeviceError
 
 RATES_HZ: Final = (8000, 16000, 22050, 32000, 44100, 48000, 88200, 96000, 192000)
-"""Rates in Hz that are tried for the message about a rate that a device does not offer."""
+"""Sampling rates, in Hz, that are tried for the message about a rate that a device does not offer."""
 
 _INVALID_CHANNEL_COUNT: Final = -9998
 _INVALID_SAMPLE_RATE: Final = -9997
@@ -31,7 +31,7 @@ class InputDevice:
     Parameters
     ----------
     name : str
-        Name by the driver.
+        Name that the driver gives.
     host_api : str
         PortAudio's name of the driver family, such as ALSA.
     channels : int
@@ -195,7 +195,7 @@ def is_active(sd: Any, stream: Any) -> bool:
 
 
 def _trouble(sd: Any, wanted: Wanted, index: int, error: Exception) -> OpeningError:
-    """Return why a device that was found does not open."""
+    """Return the reason why a device that was found does not open."""
     code = error.args[1] if len(error.args) > 1 else None
     if code in (_INVALID_SAMPLE_RATE, _INVALID_CHANNEL_COUNT):
         offered = [rate for rate in RATES_HZ if _offers(sd, index, wanted.channels, rate)]
@@ -240,7 +240,7 @@ def _inputs(sd: Any) -> list[tuple[int, InputDevice]]:
 
 
 def _described(sd: Any) -> list[Any]:
-    """Return what PortAudio knows of each device, also where names are not UTF-8, as the kernel's may be."""
+    """Return PortAudio's description of each device, even if names are not UTF-8, as those of the kernel may be."""
     try:
         return list(sd.query_devices())
     except UnicodeDecodeError:
@@ -248,7 +248,7 @@ def _described(sd: Any) -> list[Any]:
 
 
 def _with_name_replaced(sd: Any, index: int) -> Any:
-    """Return what PortAudio knows of one device, with a replacement character for each byte that is not UTF-8."""
+    """Return PortAudio's description of a device, with a replacement character for each byte that is not UTF-8."""
     try:
         return sd.query_devices(index)
     except UnicodeDecodeError:
@@ -263,7 +263,7 @@ def _with_name_replaced(sd: Any, index: int) -> Any:
 
 
 def _find(devices: Sequence[tuple[int, InputDevice]], wanted: Wanted) -> tuple[int, InputDevice]:
-    """Return PortAudio's index and a description of the device that is wanted.
+    """Return PortAudio's index and a description of the requested device.
 
     A full name takes precedence over names that contain it, so that every device can be named.
 
@@ -307,7 +307,7 @@ def _is_at(entry: HardwareInput, wanted: Wanted) -> bool:
 
 
 def _missing(devices: Sequence[tuple[int, InputDevice]], wanted: Wanted) -> OpeningError:
-    """Return why PortAudio does not list a device: it is held by another program, or not there."""
+    """Return why PortAudio does not list a device: another program uses it, or it is not connected."""
     for entry in hardware_inputs():
         listed = InputDevice(entry.name, "ALSA", 0, 0.0)
         if listed.matches(wanted.name) and _is_at(entry, wanted):

@@ -1,4 +1,4 @@
-"""An audio interface as an iterator of blocks, through a process of its own that is watched, killed and restarted.
+"""Delivers the blocks of an audio interface from a separate process, which it supervises, kills and restarts.
 
 PortAudio's thread may loop or print endlessly, or hang, when a device is unplugged, and nothing within the
 same process can stop it. The node therefore never loads the library (see `device_main`).
@@ -27,7 +27,7 @@ from livessl.errors import DeviceError
 from livessl.site.node_models import SoundDeviceConfig
 
 FIRST_REPORT_S: Final = 2.0
-"""Longest wait for the first report when the device is entered, in seconds."""
+"""Longest wait, in seconds, for the first report when the device is opened."""
 
 RESTART_S: Final = 1.0
 """Shortest interval between two starts of the process, in seconds; it doubles, up to `MAX_RESTART_S`, while the process
@@ -36,10 +36,10 @@ ends before its first report."""
 MAX_RESTART_S: Final = 8.0
 
 QUEUE_S: Final = 2.0
-"""Sound that the ring holds, in seconds: far more than any pause of a healthy caller."""
+"""Length of the sound that the ring holds, in seconds: far longer than any pause of a working caller."""
 
 HELD_NS: Final = 50_000_000
-"""Interval, in ns, at which a process that was killed and does not end is looked at."""
+"""Interval, in nanoseconds, at which it is checked whether a killed process has ended."""
 
 _log = logging.getLogger(__name__)
 
@@ -48,8 +48,8 @@ class SoundDevice:
     """An audio interface, found by name; a context manager that opens it and an iterator of its blocks.
 
     Each step waits at most 0.25 s and then yields a block without samples. If the device is absent or disappears, the
-    iterator yields empty blocks and sets `problem`; the device is opened as soon as it is there. The first block after
-    that has `overflow` set, and sample indices continue.
+    iterator yields empty blocks and sets `problem`; the device is opened as soon as it is available. The first block
+    after that has `overflow` set, and sample indices continue.
 
     Parameters
     ----------
@@ -58,20 +58,20 @@ class SoundDevice:
     channels : int
         Number of channels to record: the highest channel that any array uses.
     clock : Clock
-        For deadlines, and stamps of empty blocks.
+        Clock for deadlines and for the stamps of empty blocks.
     start : callable
         Starts the process that owns the device.
 
     Attributes
     ----------
     name : str
-        Name in the site file.
+        Name of the device in the site file.
     sample_rate_hz : float
         Nominal sampling rate, Hz.
     channels : int
         Channels of each block.
     problem : str or None
-        The present problem in words; None if there is none.
+        The present problem in words; None without a problem.
     losses : LossCount
         The blocks that were lost because this machine did not keep up, by kind.
     starts : int
@@ -79,7 +79,8 @@ class SoundDevice:
     through_sound_server : bool
         Whether its samples come through a sound server or plug-in, as far as it is known.
     interruptions : int
-        Number of times that the device had delivered and was then opened again: it was unplugged, stopped or failed.
+        Number of times that a device which had delivered blocks was opened again, because it was unplugged, stopped or
+        failed.
     """
 
     def __init__(
@@ -173,11 +174,11 @@ class SoundDevice:
 
     @property
     def has_cause(self) -> bool:
-        """True once the device's process has reported, or has failed: `problem` then names the cause of silence."""
+        """True once the device's process has reported, or has failed; `problem` then names the cause of silence."""
         return self._reported or self.starts > 1
 
     def _handed(self, block: Block) -> Block:
-        """Return a block of the process as one of the device: indices continue after a restart, gaps are marked."""
+        """Return a block of the process as one of the device: indices continue after a restart, gaps are flagged."""
         first_index = self._base_index + block.first_index
         handed = Block(first_index, block.samples, block.stamp_ns, block.overflow or self._lost)
         if self.losses.is_after_gap(handed):
@@ -204,7 +205,7 @@ class SoundDevice:
         self._give_up(run)
 
     def _look_after(self, run: DeviceRun) -> None:
-        """Take note of reports and output of the process; end it if it does not work."""
+        """Read the reports and the output of the process; end the process if it does not work."""
         for report in run.new_reports():
             if report.state is DeviceState.UNSUITABLE and not self._reported:
                 self._leave()
@@ -258,9 +259,9 @@ class SoundDevice:
             )
 
     def _wait_to_begin(self) -> None:
-        """Start the process again as soon as `RESTART_S` has passed since its last start, and the former has ended.
+        """Start the process again when `RESTART_S` has passed since its last start, and the former process has ended.
 
-        A process that the kernel holds in a driver keeps the device busy, although it was killed.
+        A killed process that still hangs in a driver of the kernel keeps the device busy.
         """
         interval_s = min(MAX_RESTART_S, RESTART_S * 2.0**self._failures)
         missing_ns = self._start_ns + round(interval_s * 1e9) - self._clock.monotonic_ns()
@@ -286,7 +287,7 @@ class SoundDevice:
 
 
 def wanted_device(config: SoundDeviceConfig, channels: int) -> Wanted:
-    """Return the settings that the process gets which owns the device."""
+    """Return the settings for the process that owns the device."""
     block_samples = max(1, round(config.block_s * config.sample_rate_hz))
     slots = max(2, math.ceil(QUEUE_S * config.sample_rate_hz / block_samples)) + 1
     return Wanted(

@@ -23,7 +23,8 @@ from livessl.core.types import FRAME_NS, Frame
 from livessl.errors import RunError
 
 MEMORY_BYTES: Final = 64 * 1024 * 1024
-"""Limit, in bytes, on frames kept in memory (no folder, or its disk is full): about 30 s of six arrays."""
+"""Limit, in bytes, of frames that are kept in memory, if there is no folder or its disk is full: about 30 s of six
+arrays."""
 
 SEGMENT_BYTES: Final = 4 * 1024 * 1024
 """Size of a segment in bytes, a few seconds of sound. Whole segments are deleted, so a restarted node sends at most one
@@ -52,16 +53,17 @@ class Kept:
 
 
 class Spool:
-    """The frames of each array in order of time; when there is no more room, the oldest are removed.
+    """The frames of each array in order of time. Beyond the limits, the oldest frames are removed.
 
-    Segments are handed to the operating system, not forced to the disk: they survive the process, not a power failure.
+    Segments are written to the operating system but not forced to the disk. They survive a crash of the process, but
+    not a power failure.
 
     Parameters
     ----------
     directory : Path or None
         Folder of the segments; None keeps the frames in memory.
     max_bytes : int
-        Most bytes of all messages together.
+        Largest number of bytes of all messages together.
     max_age_s : float
         Frames that are older than the newest by more than this are removed.
 
