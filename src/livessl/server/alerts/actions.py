@@ -1,4 +1,4 @@
-"""Actions: the ways to deliver alerts. `ACTIONS` names the type of each; a type is imported when a site uses it."""
+"""The interface of actions, which deliver alerts, and their registry `ACTIONS`. Only the types in use are imported."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ ACTIONS: Final[dict[str, str | Callable[..., object]]] = {
     "command": "livessl.server.alerts.command:Command",
     "apprise": "livessl.server.alerts.notification:Notification",
 }
-"""Registry of the actions: from the key in a site file to the factory, which gets an `ActionSetting` and returns an
-`Action`. A factory is a callable, or the text "module:attribute" of one that is imported when a server needs it."""
+"""Maps the key in a site file to the factory of the action, which gets an `ActionSetting` and returns an `Action`. A
+factory is a callable, or the text "module:attribute" of one that is imported when a server needs it."""
 
 T = TypeVar("T")
 
 
 class DeliveryError(Exception):
-    """An attempt that failed.
+    """A failed attempt to deliver an alert.
 
     Parameters
     ----------
     reason : str
-        What happened, for people.
+        Reason of the failure, in words.
     retry_after_s : float or None
-        Shortest wait that the receiver asks for, in seconds.
+        Shortest wait, in seconds, that the receiver requests.
     hopeless : bool
         Whether no further attempt can succeed.
     """
@@ -54,7 +54,7 @@ class Action(Protocol):
     """Delivers alerts, one at a time, on the event loop of the alerts."""
 
     def connected(self, ready: Callable[[], None]) -> AbstractAsyncContextManager[None]:
-        """Return a context in which it keeps a connection, if it needs one; it calls `ready` when it has made one."""
+        """Return a context in which the action keeps its connection, if any; it calls `ready` after connecting."""
         ...
 
     async def deliver(self, alert: JsonObject) -> None:
@@ -63,7 +63,7 @@ class Action(Protocol):
         Raises
         ------
         DeliveryError
-            If it did not arrive, or was not confirmed.
+            If the alert did not arrive, or was not confirmed.
         """
         ...
 
@@ -75,18 +75,18 @@ class ActionSetting:
     Parameters
     ----------
     name : str
-        Its name in the site file.
+        Name of the action in the site file.
     config : AlertAction
     site : Site
     clock : Clock
     rules : sequence of str
-        Names of the rules that take it.
+        Names of the rules that use the action.
     other_rules : sequence of str
-        Names of rules that no action of its type takes, those included that the site file no longer has.
+        Names of rules that use no action of this type, including rules that are no longer in the site file.
     url : str
         Address of the server for people.
     evidence : Evidence
-        Makes what can be attached to alerts.
+        Makes the attachments of alerts.
     """
 
     name: str
@@ -100,7 +100,7 @@ class ActionSetting:
 
     @property
     def place(self) -> str:
-        """Place of its settings in the site file."""
+        """Place of the action's settings in the site file."""
         return f"alerts.actions.{self.name}.{self.config.kind}"
 
 
@@ -120,7 +120,7 @@ def optional_library(setting: ActionSetting, name: str) -> Any:
 
 
 def client_tls(setting: ActionSetting, certificates: str | None) -> ssl.SSLContext:
-    """Return what an action needs to connect by TLS.
+    """Return the TLS context with which an action connects.
 
     Parameters
     ----------
@@ -155,7 +155,7 @@ def make_action(setting: ActionSetting) -> Action:
 
 
 async def in_daemon_thread(work: Callable[[], T]) -> T:
-    """Run work that blocks in a thread of its own, which the end of the process does not wait for."""
+    """Run blocking work in a new daemon thread, for which the end of the process does not wait."""
     loop, done = asyncio.get_running_loop(), asyncio.get_running_loop().create_future()
 
     def settle(result: T | None, error: Exception | None) -> None:

@@ -13,7 +13,8 @@ from livessl.server.api.encode import JsonObject
 from livessl.server.store import Store
 
 MAX_QUEUE: Final = 1000
-"""Most batches of events that wait to be judged: hours of sounds, unless the outbox's disk is full."""
+"""Largest number of batches of events that wait to be judged. It is reached only if the outbox's disk is full for
+hours."""
 
 
 class Batch(NamedTuple):
@@ -30,14 +31,14 @@ def final_until_ns(store: Store, site: str) -> int:
 
 
 class Backlog:
-    """Takes events from the fusion thread, and hands them to another one in order.
+    """Takes events from the fusion thread, and passes them to another thread in order.
 
     Parameters
     ----------
     site : str
         Name of the site.
     store : Store
-        Final events that do not fit into the queue are read from here, once it has them.
+        Store from which final events are read that did not fit into the queue.
     """
 
     def __init__(self, site: str, store: Store) -> None:
@@ -56,7 +57,7 @@ class Backlog:
         return len(self._queue)
 
     def add_early(self, event: JsonObject, time_ns: int) -> None:
-        """Queue an event that may still be replaced; without room it is given up, as its final result follows."""
+        """Queue an early event; without space it is dropped, because its final result follows."""
         if len(self._queue) < MAX_QUEUE:
             self._queue.append(Batch([(event, time_ns)], None))
         else:
@@ -76,14 +77,14 @@ class Backlog:
             self._added_ns = first_ns if self._added_ns is None else min(first_ns, self._added_ns)
 
     def add_change(self, change: JsonObject, time_ns: int) -> None:
-        """Queue what a track does in a zone, and its site time; without room it is given up."""
+        """Queue a change of a track in a zone, and its site time; without space it is dropped."""
         if len(self._changes) < MAX_QUEUE:
             self._changes.append((change, time_ns))
         else:
             self.unqueued += 1
 
     def work_off_changes(self, judge: Callable[[Sequence[tuple[JsonObject, int]]], None]) -> None:
-        """Hand over all changes of tracks that wait, together; what `judge` raises leaves them."""
+        """Pass all waiting changes of tracks to `judge` together; if it raises an error, they remain in the queue."""
         waiting = list(self._changes)
         if waiting:
             judge(waiting)
@@ -91,9 +92,10 @@ class Backlog:
             self._changes.popleft()
 
     def work_off(self, judge: Callable[[Batch], None]) -> None:
-        """Hand over all that waits, oldest first; what `judge` raises leaves the rest, its own batch included.
+        """Pass all waiting batches to `judge`, oldest first; if it raises an error, that batch and the rest remain.
 
-        Missed events that the store has not taken yet, because its disk is full or its file is locked, go on waiting.
+        Events that did not fit and that the store does not have yet, because its disk is full or its file is locked,
+        remain as well.
         """
         while self._queue:
             judge(self._queue[0])

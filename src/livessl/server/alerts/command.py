@@ -1,4 +1,4 @@
-"""Commands: an alert starts a program, which gets it as JSON on its standard input."""
+"""Delivers alerts to programs: each alert starts a program, which gets the alert as JSON on its standard input."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from livessl.server.alerts.message import title
 from livessl.server.api.encode import JsonObject
 
 LAST_ERRORS: Final = 4096
-"""Last part of a program's error output, in bytes, in which its last line is looked for."""
+"""Number of last bytes of a program's error output in which its last line is searched for."""
 
 MAX_ERROR: Final = 300
-"""Longest part of a program's last error output, in characters, that is kept as the reason of a failure."""
+"""Largest number of characters of a program's error output that are kept as the reason of a failure."""
 
 
 class Command:
@@ -43,18 +43,18 @@ class Command:
 
     @asynccontextmanager
     async def connected(self, ready: Callable[[], None]) -> AsyncIterator[None]:  # noqa: ARG002
-        """Keep nothing open."""
+        """Open no connection, because a program needs none."""
         yield
 
     async def deliver(self, alert: JsonObject) -> None:
-        """Run the program; it has accepted the alert if it exits with 0.
+        """Run the program, which accepts the alert by exiting with 0.
 
-        Its environment names the alert's key, rule, title, text and link: `LIVESSL_ALERT_KEY` and so on.
+        Its environment contains the alert's key, rule, title, text and link: `LIVESSL_ALERT_KEY` and so on.
 
         Raises
         ------
         DeliveryError
-            If it cannot be started, takes too long, or exits with another code.
+            If the program cannot be started, takes too long, or exits with another code.
         """
         about = {name: str(alert[name]) for name in ("key", "rule", "text", "link")} | {"title": title(alert)}
         with TemporaryFile() as errors:  # a pipe would stay open as long as a program that this one leaves behind
@@ -68,7 +68,7 @@ class Command:
         raise DeliveryError(f"{self._command[0]} exited with {code}, expected 0{why}")
 
     async def _run(self, given: bytes, about: Mapping[str, str], errors: IO[bytes]) -> int | None:
-        """Run the program with something on its standard input; return its exit code."""
+        """Run the program with `given` on its standard input; return its exit code."""
         environment = {**os.environ, **{f"LIVESSL_ALERT_{name.upper()}": value for name, value in about.items()}}
         try:
             process = await asyncio.create_subprocess_exec(

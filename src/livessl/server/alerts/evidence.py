@@ -1,4 +1,4 @@
-"""Attachments of alerts: the picture, and the clip of the event once it is cut."""
+"""Makes the attachments of alerts: the picture, and the clip of the event when it has been cut."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from livessl.server.zones.zone_map import ZoneMap
 from livessl.site.models import Site
 
 CLIP_WAIT_S: Final = 15.0
-"""Longest wait, in seconds, for the clip of an alert that is to be sent: it is cut seconds after the event's end."""
+"""Longest wait, in seconds, for the clip of an alert, which is cut some seconds after the end of the event."""
 
 QUEUED_S: Final = 3.0
 """Time, in seconds, after which an event that waits for no clip gets none."""
 
 LOOK_S: Final = 0.25
-"""Interval, in seconds, at which the clip is looked for."""
+"""Interval, in seconds, at which it is checked whether the clip has been cut."""
 
 MAX_CLIP_BYTES: Final = 8_000_000
-"""Largest clip that is attached: many mail servers refuse more."""
+"""Largest clip, in bytes, that is attached; many mail servers refuse larger mails."""
 
 
 class ClipSource(Protocol):

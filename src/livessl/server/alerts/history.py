@@ -1,4 +1,4 @@
-"""Past events for alerts: those that were not judged before a restart, and a dry run of a rule."""
+"""Reads past events for alerts: events that were not judged before a restart, and events for the dry run of a rule."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from livessl.server.zones.zone_map import ZoneMap
 from livessl.site.alert_models import AlertRule, AlertsConfig
 
 PAGE: Final = 500
-"""Events that are read from the store at a time, so that other threads do not wait for the store for long."""
+"""Number of events that are read from the store at one time, so that other threads do not wait long for the store."""
 
 MAX_TRIED: Final = 100_000
-"""Most events that a dry run looks at, the newest ones: about half a minute beside a busy server."""
+"""Largest number of events, the newest ones, that a dry run reads: about half a minute on a busy server."""
 
 EXAMPLES: Final = 20
-"""Most alerts that a dry run names."""
+"""Largest number of alerts that a dry run lists."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,13 +32,13 @@ class DryRun:
     Parameters
     ----------
     events : int
-        Events of that time that were tried.
+        Number of events of that time that were tried.
     matched : int
-        Events that meet the rule's condition.
+        Number of events that meet the rule's condition.
     alerts : int
-        Alerts that the rule would have raised.
+        Number of alerts that the rule would have raised.
     suppressed : dict of str to int
-        Events that match and would not have alerted, by verdict.
+        Number of events that match but would not have raised an alert, by verdict.
     latest : list of JsonObject
         Events of the latest alerts, newest first: their `id` and `time_utc`.
     complete : bool
@@ -67,7 +67,7 @@ def past_pages(store: Store, since_ns: int, before_ns: int) -> Iterator[tuple[li
 
 
 class DryRunBusyError(Exception):
-    """Another dry run is under way."""
+    """Another dry run has not ended yet."""
 
 
 class DryRuns:
@@ -88,12 +88,12 @@ class DryRuns:
         self._trying = threading.Lock()
 
     def run(self, rule: str, since_ns: int, before_ns: int) -> DryRun:
-        """Return what a rule on events would have done in a span of site time.
+        """Return the alerts that a rule on events would have raised in a span of site time.
 
         Raises
         ------
         DryRunBusyError
-            If another one is under way: each may read a hundred thousand events.
+            If another dry run has not ended, because each may read a hundred thousand events.
         """
         if not self._trying.acquire(blocking=False):
             raise DryRunBusyError
@@ -107,9 +107,9 @@ class DryRuns:
 def try_rule(
     rule: AlertRule, store: Store, zones: ZoneMap, timezone: str | None, since_ns: int, before_ns: int
 ) -> DryRun:
-    """Return what a rule on events would have done in a span of site time, armed all the time.
+    """Return the alerts that a rule on events would have raised in a span of site time, if it was always armed.
 
-    Of each event that matches, only what the verdict needs is kept: the span may have many.
+    For each matching event, only the data for the verdict is kept, because the span may have many events.
     """
     condition = rule.events
     assert condition is not None

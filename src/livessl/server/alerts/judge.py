@@ -1,4 +1,4 @@
-"""Judges what has happened by the rules of a site, and puts what they raise into the outbox. It starts no thread."""
+"""Applies the rules of a site to events, arrays and findings, and puts alerts into the outbox. It starts no thread."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from livessl.site.models import Site
 
 
 class _Case(NamedTuple):
-    """Something that a rule must decide about.
+    """A case that a rule has to decide.
 
     Parameters
     ----------
     rule : str
     keys : sequence of str
-        Key of its alert, then further keys under which it may have alerted before.
+        Key of the alert, then further keys that an earlier alert about the case may have.
     decide : callable
-        From the rule's state to the verdict and the state after it.
+        Returns the verdict and the new state for a state of the rule.
     make : callable
-        Makes the alert at a time, in nanoseconds.
+        Makes the alert for a time in nanoseconds.
     """
 
     rule: str
@@ -47,7 +47,7 @@ class Judge:
     site : Site
     clock : Clock
     outbox : Outbox
-        Has the states of before, and takes the new ones with what is raised.
+        Contains the earlier states, and stores new states together with alerts.
     messages : AlertMessages
     zones : callable
         Returns the zones that are in force.
@@ -87,7 +87,7 @@ class Judge:
             return dict(self._states)
 
     def arm(self, name: str, armed: bool) -> None:
-        """Arm or disarm a rule, for now and after a restart; what began before it was armed does not alert.
+        """Arm or disarm a rule permanently. Events and states that began before it was armed raise no alerts.
 
         Raises
         ------
@@ -108,16 +108,16 @@ class Judge:
         Parameters
         ----------
         events : sequence of (JsonObject, int)
-            Each with its start in nanoseconds of site time.
+            Events with their starts in nanoseconds of site time.
         until_ns : int or None
             Site time before which all final events have then been judged.
         early : bool
-            Whether they may still be replaced: only rules that ask for such events look at them.
+            Whether the events may still be replaced; only rules with `early` judge such events.
 
         Raises
         ------
         OutboxError
-            If nothing could be kept; then nothing has happened, and the events can be judged again.
+            If nothing could be stored. In this case no state has changed, and the events can be judged again.
         """
         zones = self._zones()
 
@@ -136,7 +136,7 @@ class Judge:
         return self._judge(events, cases, until_ns)
 
     def judge_changes(self, changes: Sequence[tuple[JsonObject, int]]) -> list[JsonObject]:
-        """Judge what tracks do in zones, each with its site time in nanoseconds; return the new alerts.
+        """Judge changes of tracks in zones, each with its site time in nanoseconds; return the new alerts.
 
         Raises
         ------
@@ -175,7 +175,7 @@ class Judge:
             return self._commit(raised, states) if states else []
 
     def skip(self, until_ns: int) -> None:
-        """Take everything before a site time as judged: the history of before there were alerts.
+        """Treat all events before a site time as judged, because there were no alerts yet.
 
         Raises
         ------
@@ -191,7 +191,7 @@ class Judge:
         cases: Callable[[JsonObject, int], Iterable[_Case]],
         until_ns: int | None = None,
     ) -> list[JsonObject]:
-        """Judge what has happened, each with its site time, by the rules that it concerns; return the new alerts."""
+        """Judge items, each with its site time, by the rules about them; return the new alerts."""
         with self._lock:
             states: dict[str, RuleState] = {}
             raised: dict[str, Raised] = {}

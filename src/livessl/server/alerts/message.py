@@ -47,7 +47,7 @@ class AlertMessages:
         ----------
         rule : str
         subject : str
-            Id of the event that the alert is about, or a text that names its other subject.
+            Id of the event of the alert, or a text that names another subject.
         """
         digest = hashlib.sha256("\0".join((self._site, rule, subject)).encode()).hexdigest()
         return KEY_PREFIX + digest[:KEY_DIGITS]
@@ -57,7 +57,7 @@ class AlertMessages:
         return self.key(rule, _change_subject(change, time_ns))
 
     def of_event(self, rule: str, event: JsonObject, match: Match, count: int, raised_ns: int) -> JsonObject:
-        """Return the alert about an event, which completes the `count` events that the rule waits for."""
+        """Return the alert about an event, the last of the `count` events for which the rule waits."""
         zones = [{"name": name, "probability": round(value, 4)} for name, value in match.zones.items()]
         return {
             **self._head(rule, event["id"], raised_ns),
@@ -96,7 +96,7 @@ class AlertMessages:
         return self._of_condition(rule, subject, since_ns, raised_ns, text, array=seen)
 
     def of_finding(self, rule: str, finding: Finding, about: str, since_ns: int, raised_ns: int) -> JsonObject:
-        """Return the alert about a fault of the set-up that has shown since `since_ns`, a site time.
+        """Return the alert about a fault of the set-up that has been found since `since_ns`, a site time.
 
         The text `about` names the fault in the alert's key.
         """
@@ -170,7 +170,7 @@ def title(alert: JsonObject) -> str:
 
 
 def body(alert: JsonObject) -> str:
-    """Return the text of a mail or chat message: what, when, the links, and the key that repeated messages share."""
+    """Return the text of a mail or chat message: subject, time, links, and the key, which repeated messages share."""
     lines = [alert["text"], alert["time_utc"] or "at an unknown time", alert["link"]]
     links = alert.get("links")
     if links is not None:
@@ -180,7 +180,7 @@ def body(alert: JsonObject) -> str:
 
 
 def _event_text(event: JsonObject, zones: Mapping[str, float], count: int) -> str:
-    """Return what was located, where, and how sure that is, in one line."""
+    """Return the event's position, zones and confidence in one line."""
     x, y, z = event["position_m"]
     std_m = _total_std_m(event["covariance_m2"])
     what = "sound" if count == 1 else f"{count} sounds, the last"
@@ -198,7 +198,7 @@ def _change_subject(change: JsonObject, time_ns: int) -> str:
 
 
 def _change_text(change: JsonObject) -> str:
-    """Return what a track did, where and for how long, in one line."""
+    """Return the change of a track, its zone and its stay in one line."""
     done = {"enter": "has entered", "leave": "has left", "loiter": "stays in"}[change["change"]]
     stay = "" if change["change"] == "enter" else f" after {change['stay_s']:.1f} s"
     x, y, z = change["position_m"]

@@ -1,4 +1,4 @@
-"""MQTT: alerts as messages of a broker, with availability, a last will, and discovery by Home Assistant."""
+"""Delivers alerts by MQTT, with availability, a last will, and discovery by Home Assistant."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 ONLINE: Final = "online"
 OFFLINE: Final = "offline"
-"""Payloads of the availability topic: the ones that Home Assistant expects by default."""
+"""Payloads of the availability topic, which Home Assistant expects by default."""
 
 EVENT_TYPE: Final = "alert"
 """The only type of event of each entity."""
@@ -38,7 +38,7 @@ _log = logging.getLogger(__name__)
 
 
 class Mqtt:
-    """Publishes alerts, and keeps a connection whose end the broker announces.
+    """Publishes alerts, and keeps a connection; if it ends, the broker announces that.
 
     Parameters
     ----------
@@ -69,12 +69,12 @@ class Mqtt:
 
     @property
     def availability_topic(self) -> str:
-        """The topic that says whether the server is there."""
+        """The topic of the server's availability."""
         return f"{self._topic}/availability"
 
     @asynccontextmanager
     async def connected(self, ready: Callable[[], None]) -> AsyncIterator[None]:
-        """Keep a connection to the broker, and call `ready` whenever one was made."""
+        """Keep a connection to the broker, and call `ready` after each new connection."""
         keeping = asyncio.create_task(self._keep(ready))
         try:
             yield
@@ -83,7 +83,7 @@ class Mqtt:
             await asyncio.gather(keeping, return_exceptions=True)
 
     async def deliver(self, alert: JsonObject) -> None:
-        """Publish an alert, and wait until the broker has it.
+        """Publish an alert, and wait until the broker confirms it.
 
         Raises
         ------
@@ -155,9 +155,9 @@ class Mqtt:
         return client
 
     async def _introduce(self, client: aiomqtt.Client) -> None:
-        """Publish that the server is there, and for each rule how Home Assistant shows it; the broker keeps both.
+        """Publish the server's availability and the discovery message of each rule; the broker retains them.
 
-        An empty message makes Home Assistant forget a rule that is no longer published here.
+        An empty message makes Home Assistant remove a rule that is no longer published here.
         """
         shown = {rule: orjson.dumps(self.discovery_payload(rule)) for rule in self._setting.rules}
         if self._discovery:

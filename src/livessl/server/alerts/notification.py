@@ -1,4 +1,4 @@
-"""Notifications by Apprise: e-mail, and a hundred chat and push services."""
+"""Delivers alerts by Apprise: as e-mail, or to one of a hundred chat and push services."""
 
 from __future__ import annotations
 
@@ -53,16 +53,16 @@ class Notification:
 
     @asynccontextmanager
     async def connected(self, ready: Callable[[], None]) -> AsyncIterator[None]:  # noqa: ARG002
-        """Keep nothing open."""
+        """Open no connection in advance."""
         yield
 
     async def deliver(self, alert: JsonObject) -> None:
-        """Send an alert, with its files unless an earlier attempt failed, for which the files may be the reason.
+        """Send an alert. Its files are omitted after a failed attempt, because they may have caused the failure.
 
         Raises
         ------
         DeliveryError
-            If the service does not accept it in time.
+            If the service does not accept the alert in time.
         """
         picture, clip = (None, None) if alert["key"] in self._failed else await self._files(alert)
         try:
@@ -73,7 +73,7 @@ class Notification:
             raise
 
     async def _files(self, alert: JsonObject) -> tuple[bytes | None, Path | None]:
-        """Return the picture and the clip that are to be attached; alerts of a rule with `early` wait for no clip."""
+        """Return the picture and the clip to attach; alerts of a rule with `early` do not wait for a clip."""
         picture = self._evidence.picture(alert) if "picture" in self._attached else None
         if "clip" not in self._attached:
             return picture, None
@@ -98,7 +98,7 @@ class Notification:
             raise DeliveryError("the service did not accept it; the log of Apprise says why")
 
     def _send(self, alert: JsonObject, picture: bytes | None, clip: Path | None) -> bool:
-        """Send an alert with what is attached to it; return whether the service has accepted it."""
+        """Send an alert with its attachments; return whether the service has accepted it."""
         with TemporaryDirectory(prefix="livessl-alert-") as folder:
             files = []
             if picture is not None:

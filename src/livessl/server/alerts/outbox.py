@@ -22,11 +22,11 @@ from livessl.server.alerts.rules import RuleState
 from livessl.server.api.encode import JsonObject
 
 MAX_ALERTS: Final = 100_000
-"""Most alerts that are kept, about 200 MB; the oldest are deleted first, delivered or not."""
+"""Largest number of alerts that are kept, about 200 MB; the oldest are deleted first, delivered or not."""
 
 MAX_WAITING: Final = 1000
-"""Most alerts that wait for one action. Beyond it a new one is a dead letter at once: so many waiting ones mean
-that the action does not work."""
+"""Largest number of alerts that wait for one action. Further ones become dead letters at once, because the action
+obviously does not work."""
 
 BUSY_S: Final = 1.0
 """Longest wait, in seconds, for a file that another program has locked."""
@@ -41,7 +41,7 @@ CURE: Final = "free space on its disk, or close the program that locks the file"
 
 
 class Raised(NamedTuple):
-    """An alert, the site time of what it is about in nanoseconds, and the names of the actions that deliver it."""
+    """An alert, the site time of its subject in nanoseconds, and the names of the actions that deliver it."""
 
     alert: JsonObject
     time_ns: int
@@ -58,7 +58,7 @@ class Due(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Delivery:
-    """One alert to one action."""
+    """The delivery of one alert by one action."""
 
     number: int
     key: str
@@ -74,7 +74,7 @@ class OutboxError(RunError):
 
 
 class Outbox:
-    """Keeps alerts until they are delivered, and afterwards for people to look at; every thread may call it.
+    """Keeps alerts until they are delivered, and afterwards for lists of alerts; every thread may call it.
 
     Parameters
     ----------
@@ -104,7 +104,7 @@ class Outbox:
         now_ns: int,
         judged: tuple[str, int] | None = None,
     ) -> list[JsonObject]:
-        """Keep what was raised, all or nothing; return the alerts that are new.
+        """Store raised alerts and states, all or nothing; return the alerts that are new.
 
         Parameters
         ----------
@@ -153,7 +153,7 @@ class Outbox:
         return any(self._rows("SELECT 1 FROM alerts WHERE key = ?", (key,)) for key in keys)
 
     def get(self, key: str) -> JsonObject | None:
-        """Return the alert of a key; None if there is none, or none any more."""
+        """Return the alert with a key; None if there is none, or it has been deleted."""
         rows = self._rows("SELECT json FROM alerts WHERE key = ?", (key,))
         return dict(json.loads(rows[0][0])) if rows else None
 
@@ -162,19 +162,20 @@ class Outbox:
         return {name: RuleState.restored(json.loads(text)) for name, text in self._rows("SELECT * FROM rules")}
 
     def judged_until_ns(self, site: str) -> int | None:
-        """Return the site time before which all final events have been judged; None at the very beginning."""
+        """Return the site time before which all final events have been judged; None before the first."""
         rows = self._rows("SELECT until_ns FROM judged WHERE site = ?", (site,))
         return int(rows[0][0]) if rows else None
 
     def forget_judged(self, site: str) -> None:
-        """Forget how far the events of a site are judged, because no rule is on events any more."""
+        """Forget up to which time the events of a site are judged, because no rule is about events any more."""
         with self._kept() as db:
             db.execute("DELETE FROM judged WHERE site = ?", (site,))
 
     def due(self, action: str, now_ns: int, longest_wait_ns: int) -> Due | None:
-        """Return the delivery that is due first, None if none is.
+        """Return the delivery that is due first; None if none is due.
 
-        One whose time lies further ahead than any wait is due as well: the machine's clock was set back.
+        A delivery whose time is further in the future than the longest wait is due as well, because the machine's clock
+        was set back.
         """
         sql = (
             "SELECT d.number, d.attempts, a.json FROM deliveries d JOIN alerts a USING (key) WHERE d.action = ? "
@@ -184,13 +185,13 @@ class Outbox:
         return Due(rows[0][0], rows[0][1], json.loads(rows[0][2])) if rows else None
 
     def next_due_ns(self, action: str) -> int | None:
-        """Return the time of the next attempt; None if nothing waits."""
+        """Return the time of the next attempt; None if no delivery waits."""
         sql = "SELECT min(next_ns) FROM deliveries WHERE action = ? AND state = ?"
         [(next_ns,)] = self._rows(sql, (action, DeliveryState.WAITING))
         return None if next_ns is None else int(next_ns)
 
     def hasten(self, action: str, now_ns: int) -> None:
-        """Make everything that waits for an action due now: it can be reached again."""
+        """Make all deliveries that wait for an action due now, because the action can be reached again."""
         with self._kept() as db:
             db.execute(
                 "UPDATE deliveries SET next_ns = ? WHERE action = ? AND state = ? AND next_ns > ?",
@@ -215,7 +216,7 @@ class Outbox:
             )
 
     def resend(self, number: int, now_ns: int) -> bool:
-        """Let a dead letter wait for an attempt at once, with all attempts before it; False if there is none."""
+        """Make a dead letter due now, with all attempts available again; return False if there is none."""
         with self._kept() as db:
             found = db.execute(
                 "UPDATE deliveries SET state = ?, attempts = 0, next_ns = ? WHERE number = ? AND state = ?",
@@ -224,7 +225,7 @@ class Outbox:
         return found > 0
 
     def abandon(self, actions: Iterable[str]) -> int:
-        """Give up what waits for any action but these, which the site has; return how many alerts that are."""
+        """Give up the deliveries of actions other than these, which the site has; return their number."""
         known = list(actions)
         marks = ", ".join("?" * len(known))
         with self._kept() as db:
@@ -249,7 +250,7 @@ class Outbox:
             ).rowcount
 
     def not_in_journal(self, most: int) -> list[JsonObject]:
-        """Return the alerts that the journal of the history is not known to have, oldest first, so many at most."""
+        """Return at most `most` alerts that the journal of the history may lack, oldest first."""
         rows = self._rows("SELECT json FROM alerts WHERE NOT in_journal ORDER BY number LIMIT ?", (most,))
         return [json.loads(text) for (text,) in rows]
 
@@ -291,7 +292,7 @@ class Outbox:
         return {(action, state): int(count) for action, state, count in rows}
 
     def expire(self, before_ns: int) -> int:
-        """Delete alerts about what happened before a time, and overwrite them in the file; return their number."""
+        """Delete alerts with subjects before a time, and overwrite them in the file; return their number."""
         with self._kept() as db:
             gone = db.execute("DELETE FROM alerts WHERE time_ns < ?", (before_ns,)).rowcount
         if gone:

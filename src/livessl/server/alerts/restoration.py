@@ -1,4 +1,4 @@
-"""Alerts at the start of a server: what the journal and the hub lack is taken from the outbox."""
+"""Restores alerts at the start of a server: alerts that the journal or the hub lacks are taken from the outbox."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from livessl.server.alerts.outbox import OutboxError
 from livessl.server.parts import Parts
 
 RESTORED: Final = 10_000
-"""Most alerts of the outbox, about 20 MB, that a start puts into the journal because it lacks them; the next start goes
-on with the others."""
+"""Largest number of alerts, about 20 MB, that one start copies from the outbox into the journal. The next start copies
+further ones."""
 
 RESTORED_AGAIN: Final = 100
 """Newest alerts of the outbox that are put at each start into the messages for the hub, and into a
@@ -21,9 +21,10 @@ _log = logging.getLogger(__name__)
 
 
 def restore_alerts(parts: Parts) -> None:
-    """Put into the journal the alerts that are in the outbox only, as after an outage of the database.
+    """Copy alerts into the journal that are only in the outbox, for example after an outage of the database.
 
-    The hub gets the newest ones again, and knows which it has: they may not have been among its messages yet.
+    The newest alerts are also sent to the hub again, because they may not have been among its messages. The hub ignores
+    alerts that it already has.
     """
     alerts, is_durable = parts.alerts, parts.store.is_durable
     try:

@@ -1,4 +1,4 @@
-"""The thread of the alerts: takes turns at judging, and runs the deliverers meanwhile. It knows no rules."""
+"""Runs the thread of the alerts, which judges events in turns and runs the deliverers. It contains no rules."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Final
 from livessl.server.alerts.delivery import REST_S, Deliverer
 
 POLL_S: Final = 0.5
-"""Longest wait, in seconds, between two turns: arrays and findings are looked at as often."""
+"""Longest wait, in seconds, between two turns; arrays and findings are judged in every turn."""
 
 STOP_S: Final = 3.0
 """Longest wait, in seconds, for the thread when the server stops."""
@@ -25,32 +25,32 @@ class TurnTooLongError(Exception):
 
 
 class _Claim:
-    """Work that is either begun or given up, whatever two threads do at once."""
+    """Work that is either begun or given up, even if two threads decide at the same time."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._is_begun = self._is_given_up = False
 
     def begin(self) -> bool:
-        """Begin it; return False if it was given up."""
+        """Begin the work; return False if it was given up."""
         with self._lock:
             self._is_begun = not self._is_given_up
             return self._is_begun
 
     def give_up(self) -> bool:
-        """Give it up; return False if it has begun."""
+        """Give the work up; return False if it has begun."""
         with self._lock:
             self._is_given_up = not self._is_begun
             return self._is_given_up
 
 
 class AlertThread:
-    """Judges and delivers on an event loop of its own; every thread may call it.
+    """Judges and delivers on its own event loop; every thread may call it.
 
     Parameters
     ----------
     turn : callable
-        Judges what waits; returns False if it failed and is to rest before the next turn. The thread calls it.
+        Judges waiting events; returns False if it failed, and the thread then rests before the next turn.
     deliverers : callable
         Returns the deliverers of the actions that are in force.
     """
@@ -76,7 +76,7 @@ class AlertThread:
         self._thread.start()
 
     def stop(self) -> None:
-        """Stop; what waits is delivered after the next start."""
+        """Stop the thread; waiting alerts are delivered after the next start."""
         if self._thread is not None:
             self._call(self._end.set)
             self._thread.join(timeout=STOP_S)
@@ -86,7 +86,7 @@ class AlertThread:
         self._call(self._news.set)
 
     def wake_deliverers(self) -> None:
-        """Have the deliverers look for new deliveries."""
+        """Make the deliverers read new deliveries from the outbox."""
         for deliverer in self._deliverers():
             self._call(deliverer.wake)
 
@@ -96,9 +96,9 @@ class AlertThread:
         Raises
         ------
         TurnTooLongError
-            If no turn ended within `longest_s` seconds; then `work` is not done later either.
+            If no turn ended within `longest_s` seconds. In this case `work` is not done later.
         Exception
-            What `work` raises.
+            Errors that `work` raises.
         """
         assert self._loop is not None
         claim = _Claim()
@@ -157,7 +157,7 @@ class AlertThread:
                     task.result()  # raises the error that ended it
 
     async def _judge_all(self) -> None:
-        """Judge what comes, and first what came before a restart, until cancelled."""
+        """Judge events until cancelled, and first those from before a restart."""
         while True:
             self._news.clear()
             wait_s = POLL_S if self._turn() else REST_S
@@ -168,7 +168,7 @@ class AlertThread:
                 await asyncio.sleep(REST_S)
 
     def _call(self, work: Callable[[], None]) -> None:
-        """Have something done on the thread's loop, if it runs."""
+        """Do some work on the thread's loop, if it runs."""
         loop = self._loop
         if loop is not None:
             with suppress(RuntimeError):  # it has just been closed

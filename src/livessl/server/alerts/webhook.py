@@ -23,7 +23,7 @@ from livessl.site.secret_files import fault, read_secret
 
 SECRET_PREFIX: Final = "whsec_"  # noqa: S105 - a prefix, not a secret
 SECRET_BYTES: Final = range(24, 65)
-"""Lengths of a secret in bytes that the specification allows: 192 to 512 bits."""
+"""Lengths of a secret, in bytes, that the specification allows: 192 to 512 bits."""
 
 MAX_HEAD_BYTES: Final = 16_384
 """Longest head of an HTTP answer that is read, in bytes; its body is not read."""
@@ -70,11 +70,11 @@ class Webhook:
 
     @asynccontextmanager
     async def connected(self, ready: Callable[[], None]) -> AsyncIterator[None]:  # noqa: ARG002
-        """Keep nothing open: alerts are rare."""
+        """Open no connection in advance, because alerts are rare."""
         yield
 
     async def deliver(self, alert: JsonObject) -> None:
-        """Post an alert; any answer but 2xx is a failure, and redirections are not followed.
+        """Post an alert. Every status other than 2xx is a failure, and redirections are not followed.
 
         Raises
         ------
@@ -113,7 +113,7 @@ class Webhook:
         return "\r\n".join((*lines, "", "")).encode("ascii") + payload
 
     async def _post(self, request: bytes) -> bytes:
-        """Send a request on a connection of its own; return the head of the final answer."""
+        """Send a request on a new connection; return the head of the final answer."""
         reader, writer = await asyncio.open_connection(
             self._host, self._port, ssl=self._tls, limit=MAX_HEAD_BYTES, happy_eyeballs_delay=0.25
         )
