@@ -38,7 +38,7 @@ def add_recordings(parser: Any, site: str = "site file (default: the session's o
     parser.add_argument(
         "--session", action="append", type=Path, default=[], metavar="DIR", help="recorded session; repeatable"
     )
-    add_wav(parser, "WAV or FLAC recording of one array, instead of --session; repeat for each array")
+    add_wav(parser, "WAV or FLAC recording of one array, instead of --session; repeat the option for each array")
     add_joint(parser)
 
 
