@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 WAIT_S: Final = 2.0
 """Interval, in seconds, at which the thread looks for new sounds."""
 
-SHARE: Final = 0.02
+SHARE: Final = 0.01
 """Greatest share of one core's time that refinements take. Poses that are off are no matter of seconds."""
 
 REFINED_SOUNDS: Final = 20

@@ -30,7 +30,7 @@ KEPT_SOUNDS: Final = 12
 WAIT_S: Final = 1.0
 """Interval, in seconds, at which the thread looks for new sounds."""
 
-SHARE: Final = 0.04
+SHARE: Final = 0.02
 """Greatest share of one core's time that examinations take. Where sounds come fast, several are examined at a time."""
 
 _log = logging.getLogger(__name__)
