@@ -6,7 +6,7 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from playwright.sync_api import Browser, Error, FloatRect, Locator, Page, Request, sync_playwright
+from playwright.sync_api import Browser, Error, FloatRect, Locator, Page, Request, expect, sync_playwright
 
 from conftest import require
 from small_site import HANG_S, wait_until
@@ -16,6 +16,8 @@ BROWSERS = ("chromium-headless-shell", "chromium", "chromium-browser", "google-c
 
 INTERFACES_CHANGED = "ERR_NETWORK_CHANGED"
 """Chromium's error of requests under way when a network interface comes or goes, as it does in tests of cables."""
+
+expect.set_options(timeout=1000 * HANG_S)
 
 
 def browser_program() -> str:

@@ -71,10 +71,18 @@ def test_work_rests_until_it_has_taken_its_share_of_a_core_at_most() -> None:
         assert rest_s >= 0.99 * 4.0 * taken_s  # one part of work, four parts of rest
 
 
-def test_urgent_work_does_not_rest() -> None:
+def test_urgent_work_takes_a_larger_share() -> None:
     work = Work(3)
     with working(work, share=1e-6, is_urgent=lambda: True):  # would rest for hours
         assert work.done.wait(HANG_S)
+
+
+def test_thread_that_is_woken_does_not_rest_to_the_end() -> None:
+    work = Work(1)
+    with working(work, share=1e-6) as thread:
+        assert work.done.wait(HANG_S)
+        thread.wake()
+        wait_until(lambda: len(work.spans) == 2, "the second piece of work")
 
 
 def test_nothing_is_done_under_overload() -> None:

@@ -172,7 +172,7 @@ class _Assembly:
             reloader=self.reloader,
             recent_log=RecentLog(),
         )
-        for follower in (self.engine, self.set_up_watch, self.clips):
+        for follower in (self.engine, self.set_up_watch, parts.refiner, self.clips):
             if follower is not None:
                 self.set_up.follow(follower.prepare)
         return parts

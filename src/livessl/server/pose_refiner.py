@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -84,6 +85,10 @@ class PoseRefiner:
             "refine", self.refine_if_new, overload, wait_s=WAIT_S, share=SHARE, what="the refinement of the poses"
         )
         """Calls `refine_if_new`."""
+
+    def prepare(self, _site: Site) -> Callable[[], None]:
+        """Return what makes the thread refine soon, with the poses that are in force then; any thread."""
+        return self.thread.wake
 
     def refine_if_new(self) -> None:
         """Refine if there are enough new sounds or other poses; the thread calls it, and a test may."""

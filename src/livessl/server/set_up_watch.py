@@ -33,6 +33,9 @@ WAIT_S: Final = 1.0
 SHARE: Final = 0.02
 """Greatest share of one core's time that examinations take. Where sounds come fast, several are examined at a time."""
 
+URGENT_SHARE: Final = 0.2
+"""Greatest share of one core's time while a finding waits to be confirmed or to end: echoes may keep it so for ever."""
+
 _log = logging.getLogger(__name__)
 
 
@@ -104,6 +107,7 @@ class SetUpWatch:
             overload,
             wait_s=WAIT_S,
             share=SHARE,
+            urgent_share=URGENT_SHARE,
             what="the examination of the set-up",
             is_urgent=lambda: self.is_urgent,
         )
@@ -169,6 +173,7 @@ class SetUpWatch:
             self._steady = SteadyFindings()
             self._unjudged = len(self._sounds)
             self._note(())
+        self.thread.wake()
 
     def examine(self) -> None:
         """Examine the sounds if there are new ones; the thread calls it, and a test may."""

@@ -33,10 +33,12 @@ class SpareTimeThread:
         Shortest time between two pieces of work, in seconds, and the interval at which the thread looks for work.
     share : float
         Greatest share of one core's time, above 0 and at most 1.
+    urgent_share : float, optional
+        The same while the work is urgent.
     what : str
         What the work is, for the log.
     is_urgent : callable, optional
-        Returns whether the next piece of work is wanted soon, so that the thread does not rest before it.
+        Returns whether the next piece of work is wanted soon.
     """
 
     def __init__(
@@ -48,6 +50,7 @@ class SpareTimeThread:
         wait_s: float,
         share: float,
         what: str,
+        urgent_share: float = 1.0,
         is_urgent: Callable[[], bool] = lambda: False,
     ) -> None:
         self._name = name
@@ -55,9 +58,11 @@ class SpareTimeThread:
         self._overload = overload
         self._wait_s = wait_s
         self._share = share
+        self._urgent_share = urgent_share
         self._what = what
         self._is_urgent = is_urgent
-        self._stop = threading.Event()
+        self._wake = threading.Event()
+        self._is_stopped = False
         self._thread: threading.Thread | None = None
         self.failure: BaseException | None = None
         """The error that has ended the thread, if one has."""
@@ -69,21 +74,30 @@ class SpareTimeThread:
 
     def stop(self) -> None:
         """Stop, and wait a little for the thread."""
-        self._stop.set()
+        self._is_stopped = True
+        self._wake.set()
         if self._thread is not None:
             self._thread.join(timeout=JOIN_S)
+
+    def wake(self) -> None:
+        """End a rest: there is work that should not wait. Any thread."""
+        self._wake.set()
 
     def _run(self) -> None:
         rest_s = self._wait_s
         try:
-            while not self._stop.wait(rest_s):
+            while True:
+                self._wake.wait(rest_s)
+                self._wake.clear()
+                if self._is_stopped:
+                    return
                 rest_s = self._wait_s
                 if self._overload.message is not None:
                     continue
                 began_s = thread_time_s()
                 self._work()
-                if not self._is_urgent():
-                    rest_s = max(rest_s, (thread_time_s() - began_s) * (1.0 / self._share - 1.0))
+                share = self._urgent_share if self._is_urgent() else self._share
+                rest_s = max(rest_s, (thread_time_s() - began_s) * (1.0 / share - 1.0))
         except BaseException as error:
             self.failure = error
             _log.exception("%s has failed; the server ends", self._what)

@@ -54,6 +54,16 @@ def test_publications_are_further_apart_than_the_confirming_sounds(shown: list[b
     assert changes <= 1 + len(shown) // CONFIRMING_SOUNDS
 
 
+@given(sounds=st.integers(4, 64), rounds=st.integers(2, 20))
+def test_finding_of_every_other_examination_of_many_sounds_is_published_once(sounds: int, rounds: int) -> None:
+    steady = SteadyFindings()
+    for _ in range(rounds):
+        assert steady.note([TURNED], sounds) == (TURNED,)
+        assert steady.note([], sounds) == (TURNED,)
+    ended = [steady.note([], sounds) for _ in range(2)]
+    assert ended[-1] == ()  # at most three examinations without it end it
+
+
 def test_latest_words_of_a_finding_are_published() -> None:
     newer = finding("turned", message="misfit 30 -> 12 us")
     assert published(([TURNED], 3), ([newer], 1)) == (newer,)

@@ -14,6 +14,11 @@ CONFIRMING_SOUNDS: Final = 2
 MOST_CONFIRMING: Final = 6
 """Most confirming sounds that count, so that a finding ends soon after the set-up has been mended."""
 
+MOST_FOR: Final = 4
+MOST_AGAINST: Final = 3
+"""Most sounds of one examination that count for and against a finding: they were examined together, and have one
+answer. A finding that was published with many sounds thus needs two examinations to end."""
+
 UNSURE: Final = 0.5
 """Confidence up to which a finding must come again before it is published, however many sounds it is of: the echo of a
 single sound may cause a contradiction that nothing explains."""
@@ -40,11 +45,12 @@ class _Question:
 
     def note(self, answer: tuple[Finding, ...], sounds: int) -> None:
         """Take in the answer after some more sounds."""
+        against, sounds = min(sounds, MOST_AGAINST), min(sounds, MOST_FOR)
         if self.published and _identity(answer) == _identity(self.published):
             self.published, self.support = answer, min(self.support + sounds, MOST_CONFIRMING)
             self.rival, self.rival_support = (), 0
             return
-        self.support -= sounds
+        self.support -= against
         if self.support <= 0:
             self.published, self.support = (), 0
         is_new = _identity(answer) != _identity(self.rival)

@@ -145,12 +145,7 @@ class Onset(MapEstimator):
             return self._onsets.frames(part, strongest[part.spec.name])
 
         if outside is None or not outside.is_sufficient:
-            separation = self._second_source.separate(
-                answer.consensus,
-                answer.evidence,
-                strongest,
-                lambda part: self._onsets.frames(part, strongest[part.spec.name]),
-            )
+            separation = self._second_source.separate(answer.consensus, answer.evidence, strongest, frames)
         others: tuple[Localization, ...] = ()
         if separation is not None:
             second, judgement = separation.second, separation.judgement

@@ -97,7 +97,8 @@ def windows_ns(site: Site, start_ns: int, end_ns: int) -> list[int]:
 def play(site_file_text: str, endpoint: str, rt60_s: float, parent: Connection) -> None:
     """Load a server, in a process of its own.
 
-    It sends `None` when the sound is ready, begins and ends at messages of the parent, and sends its `Report`.
+    It sends `None` once the sound is ready. A message of the parent starts it, and another one ends it; then it sends
+    its `Report`.
     """
     site, clock = parse_site(site_file_text), SystemClock()
     scene = _scene(site, rt60_s)

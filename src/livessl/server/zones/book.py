@@ -58,7 +58,8 @@ class ZoneBook:
         ValueError
             If its name cannot be used, or the zone lies outside the room.
         ZoneRefusedError
-            If the site file owns it, or there is no room for it.
+            If the site file owns it or names no file for drawn zones, if there are `MAX_DRAWN` drawn zones already, or
+            if it is excluded and a rule uses it.
         ZonesFileError
             If it cannot be kept; then nothing has changed.
         """
