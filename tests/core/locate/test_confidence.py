@@ -13,6 +13,7 @@ from free_field import BAND_HZ, C_M_S, RATE_HZ, ideal_gcc, tetra, true_lags_s
 from livessl.core.geometry import Grid, line, posed
 from livessl.core.locate import refine
 from livessl.core.locate.confidence import (
+    AGREED,
     CLEAR_PEAK_TO_RMS,
     LEAST_CONFIDENCE,
     ConfidenceFeatures,
@@ -86,6 +87,14 @@ def test_a_second_array_with_a_weak_peak_hardly_determines_the_distance(weak: fl
     assert replace(first, second_array=weak + more).confidence > first.confidence
     clear = replace(first, second_array=CLEAR_PEAK_TO_RMS)
     assert replace(clear, second_array=CLEAR_PEAK_TO_RMS + more).confidence == clear.confidence
+
+
+@given(disagreement=st.floats(0.0, AGREED), more=st.floats(0.05, 1.0))
+def test_confidence_falls_once_arrays_disagree(disagreement: float, more: float) -> None:
+    agreed = ConfidenceFeatures(0.3, 6.0, crossing_deg=60.0, second_array=3.0)
+    assert replace(agreed, disagreement=disagreement).confidence == agreed.confidence
+    assert replace(agreed, disagreement=AGREED + more).confidence < agreed.confidence
+    assert replace(agreed, disagreement=AGREED + 1.0).confidence < LEAST_CONFIDENCE
 
 
 @given(spread_m=st.floats(0.01, 0.2), more=st.floats(0.05, 1.0))

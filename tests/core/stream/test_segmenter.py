@@ -126,6 +126,93 @@ def test_steady_noise_is_quiet_although_the_device_fades_in(seed: int, begin: fl
     assert frame_indices(run((1e-2 * noise / noise.std()).astype(np.float32)), Frame) == []
 
 
+def after_silence(*parts: Float32Array | float) -> Float32Array:
+    """Join sound (4, n); a number is digital silence of as many seconds."""
+    joined = [np.zeros((4, round(part * RATE_HZ))) if isinstance(part, float) else part for part in parts]
+    return np.asarray(np.concatenate(joined, axis=1), dtype=np.float32)
+
+
+def decaying(level: float, rt60_s: float, duration_s: float, seed: int) -> Float32Array:
+    """A burst (4, n) that decays by 60 dB in `rt60_s`."""
+    times_s = np.arange(round(duration_s * RATE_HZ)) / RATE_HZ
+    wave = np.random.default_rng(seed).standard_normal((4, len(times_s)))
+    return np.asarray(level * wave * 10.0 ** (-3.0 * times_s / rt60_s), dtype=np.float32)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    seed=st.integers(0, 1 << 30),
+    silence_s=st.floats(0.01, 4.5),
+    level_db=st.floats(-85.0, -20.0),
+    constant=st.sampled_from([0.0, 2.0**-15, -(2.0**-15)]),
+)
+def test_steady_noise_after_digital_silence_is_no_sound_and_hides_none(
+    seed: int, silence_s: float, level_db: float, constant: float
+) -> None:
+    """The silence is at the start, in the middle and both; a burst 5 s after it is found."""
+    level = 10.0 ** (level_db / 20.0)
+    noise = sound([level] * 100, seed)
+    burst = noise.copy()
+    burst[:, : round(0.3 * RATE_HZ)] += decaying(20.0 * level, 0.3, 0.3, seed + 1)
+    for parts in ((silence_s, noise), (noise, silence_s, noise), (silence_s, noise, silence_s, noise)):
+        samples = after_silence(*parts, burst)
+        messages = run(samples + np.float32(constant) * (samples == 0.0))
+        begin = samples.shape[1] - burst.shape[1]
+        active = [frame.frame_index - START for frame in frames_of(messages) if frame.active]
+        assert active
+        assert begin // N <= min(active) <= begin // N + 1
+        assert list(dict.fromkeys(m.frame_index - START for m in messages)) == list(range(samples.shape[1] // N))
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    seed=st.integers(0, 1 << 30),
+    silence_s=st.floats(0.06, 4.0),
+    level_db=st.floats(-50.0, -10.0),
+    rt60_s=st.floats(0.1, 2.5),
+)
+def test_bursts_between_digital_silences_are_found(seed: int, silence_s: float, level_db: float, rt60_s: float) -> None:
+    """They decay into silence, as those of a simulation without noise."""
+    burst = decaying(10.0 ** (level_db / 20.0), rt60_s, 1.5 * rt60_s, seed)
+    messages = run(after_silence(silence_s, burst, 1.0, 0.5 * burst, 4.0, burst, 1.0))
+    active = {frame.frame_index - START for frame in frames_of(messages) if frame.active}
+    begins_s = np.cumsum([silence_s, burst.shape[1] / RATE_HZ + 1.0, burst.shape[1] / RATE_HZ + 4.0])
+    for begin_s in begins_s:
+        assert active & {int(begin_s / FRAME_S), int(begin_s / FRAME_S) + 1}
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 1 << 30), silence_s=st.floats(0.1, 4.0), lead_s=st.floats(0.0, 0.4))
+def test_burst_in_noise_just_after_digital_silence_is_found_and_ends(
+    seed: int, silence_s: float, lead_s: float
+) -> None:
+    noise = sound([1e-3] * 80, seed)
+    first = round(lead_s * RATE_HZ)
+    noise[:, first : first + N * 10] += decaying(0.1, 0.4, 0.5, seed + 1)
+    messages = run(after_silence(silence_s, noise))
+    active = [frame.frame_index - START for frame in frames_of(messages) if frame.active]
+    begin = int((silence_s + lead_s) / FRAME_S)
+    assert active
+    assert begin <= min(active) <= begin + 1
+    assert max(active) <= begin + 10
+
+
+def test_steady_sounds_of_a_noise_gate_are_found_from_the_second_on() -> None:
+    """The first one is held back for the warm-up and then taken for the background; a gate shows by closing again."""
+    steady = sound([LOUD] * 24)
+    messages = run(after_silence(1.0, steady, 2.0, steady, 5.0, steady, 1.0))
+    active = [frame.frame_index - START for frame in frames_of(messages) if frame.active]
+    assert active == [*range(84, 108), *range(208, 232)]
+
+
+def test_digital_silence_is_marked_at_once() -> None:
+    framer, made = Framer(RATE_HZ), segmenter()
+    (cut,) = framer.push(Block(0, np.zeros((4, N), dtype=np.float32), START * FRAME_NS))
+    (mark,) = made.push(cut, framer.state)
+    assert isinstance(mark, Mark)
+    assert (mark.power, mark.noise_power) == (0.0, 0.0)
+
+
 @pytest.mark.parametrize("lead", [1, 2, 3])
 def test_sound_that_begins_soon_is_found_however_long_it_lasts(lead: int) -> None:
     messages = run(sound([QUIET] * lead + [LOUD] * 60 + [QUIET] * 20))

@@ -57,6 +57,13 @@ _WEAK_FIT: Final = 1.5
 """Log-odds lost for each unit of the peak-to-RMS ratio by which the second array falls short of `CLEAR_PEAK_TO_RMS`,
 where lines of sight that cross determine the distance: one of them is then little better than noise."""
 
+_DISAGREEMENT_FIT: Final = 6.0
+"""Log-odds lost for each unit of `ConfidenceFeatures.disagreement` above `AGREED`: 1 leaves hardly any position."""
+
+AGREED: Final = 0.6
+"""Peak-to-RMS ratio that one of two arrays may lose at the right position, in a set-up that is off by the default
+`livessl.core.types.Uncertainty`."""
+
 _LINES_SPREAD_FIT: Final = 10.0
 """Factor on the standard deviation along the position's least certain axis where all arrays are lines: three of them
 give as many angles as there are coordinates, with none to spare. The share of errors beyond `NEAR_M` is then normal."""
@@ -119,6 +126,8 @@ class ConfidenceFeatures:
         Greatest standard deviation of the position by its covariance, metres.
     of_lines : bool
         Whether the microphones of each array lie on a line, so that no array alone gives a direction.
+    disagreement : float
+        Greater one of the peak-to-RMS ratios that two arrays lose against their own highest places; 0 if unknown.
     """
 
     margin: float
@@ -131,6 +140,7 @@ class ConfidenceFeatures:
     beginning: float | None = None
     spread_m: float = 0.0
     of_lines: bool = False
+    disagreement: float = 0.0
 
     @property
     def confidence(self) -> float:
@@ -171,6 +181,7 @@ class ConfidenceFeatures:
         intercept, of_margin, of_ratio = _WHOLE_SEGMENT_FIT if self.whole else _ONSET_FIT
         log_odds = intercept + of_margin * self.margin + of_ratio * self.peak_to_rms
         lost = _BACKGROUND_FIT * self.background + _BEGINNING_FIT * self.lacking + _WEAK_FIT * self.weakness
+        lost += _DISAGREEMENT_FIT * max(0.0, self.disagreement - AGREED)
         return _probability(log_odds - lost)
 
     @property

@@ -227,7 +227,7 @@ class Onset(MapEstimator):
             return known.get(_names(parts)) or self._place(parts)
 
         consensus = outliers.consensus(kept, suspect, self._search, self.grid, self.c_m_s, place_of)
-        judgement = consensus.place.judgement(self.grid, whole=whole)
+        judgement = consensus.judgement(self.grid, whole=whole)
         return _Answer(kept, _names(kept), consensus, judgement, consensus.refused or judgement.refused)
 
     def _highest_power(self, evidence: Evidence) -> float:

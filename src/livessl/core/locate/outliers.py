@@ -9,17 +9,17 @@ or makes the others lose theirs. Errors that every set-up has are no disagreemen
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from typing import Final
 
 import numpy as np
 
 from livessl.core.geometry import Grid, angle_deg, pair_weight
-from livessl.core.locate.confidence import NEAR_M, array_power, peak_to_rms
+from livessl.core.locate.confidence import AGREED, LEAST_CONFIDENCE, NEAR_M, Judgement, array_power, peak_to_rms
 from livessl.core.locate.peak_search import PeakSearch
 from livessl.core.locate.place import Place
 from livessl.core.locate.srp import PairTerms
-from livessl.core.types import ArraySpec, Evidence, FloatArray, IntArray
+from livessl.core.types import ArraySpec, Evidence, FloatArray, IntArray, Uncertainty
 
 MAX_LOSS: Final = 0.8
 """Summed loss of peak-to-RMS ratio above which arrays count as disagreeing. An array is an outlier if the loss without
@@ -64,11 +64,24 @@ class Consensus:
         place.
     refused : str or None
         Reason, in words, not to rely on the place; None if it can be relied on.
+    disagreement : float
+        Greater one of the peak-to-RMS ratios that two arrays lose at the place; 0 for any other number.
     """
 
     place: Place
     outliers: Mapping[str, float] = field(default_factory=dict)
     refused: str | None = None
+    disagreement: float = 0.0
+
+    def judgement(self, grid: Grid, *, whole: bool = False) -> Judgement:
+        """Judge the place, and lower its confidence as far as two arrays disagree about it."""
+        judgement = self.place.judgement(grid, whole=whole)
+        features = replace(judgement.features, disagreement=self.disagreement)
+        confidence = features.confidence_of_candidates if judgement.candidates else features.confidence
+        refused = judgement.refused
+        if refused is None and confidence < LEAST_CONFIDENCE:
+            refused = _refusal(self.place.evidence)
+        return replace(judgement, features=features, refused=refused)
 
 
 def consensus(
@@ -124,7 +137,8 @@ def consensus(
         break
     place, disagreeing = _with_suspects(place, last, own, locate)
     outliers += disagreeing
-    return Consensus(place, {part.spec.name: own.angle_deg(part, place.position_m) for part in outliers})
+    off_deg = {part.spec.name: own.angle_deg(part, place.position_m) for part in outliers}
+    return Consensus(place, off_deg, disagreement=own.disagreement(place))
 
 
 def _by_trust(evidence: Sequence[Evidence], suspect: Collection[str]) -> tuple[list[Evidence], list[Evidence]]:
@@ -188,6 +202,23 @@ class _OwnPeaks:
                     loss[name] = max(0.0, peak_to_rms(part, self._at(part)[0]) - here[name])
         return loss
 
+    def disagreement(self, place: Place) -> float:
+        """Greater one of the peak-to-RMS ratios that two arrays lose at `place`; 0 for any other number of arrays.
+
+        Delays count as exact unless an array's set-up is described as less certain than usual. Up to `AGREED` it may be
+        an upper bound, which needs no search.
+        """
+        if len(place.evidence) != 2:
+            return 0.0
+        greatest = 0.0
+        terms = place.functional.pair_terms(place.position_m)
+        for part, term in zip(place.evidence, terms, strict=True):
+            power = array_power(part, term) if _is_usual(part.spec.uncertainty) else self._power(part, term, place)
+            here = peak_to_rms(part, power)
+            lost = _upper_bound(part) - here
+            greatest = max(greatest, lost if lost <= AGREED else peak_to_rms(part, self._at(part)[0]) - here)
+        return greatest
+
     def _power(self, evidence: Evidence, term: PairTerms, place: Place) -> float:
         """Return the greatest SRP of an array at a place if each delay may have the error that the set-up allows."""
         values, lags_s = evidence.gcc.values, evidence.gcc.lags_s
@@ -232,6 +263,12 @@ def allowed_s(spec: ArraySpec, pairs: IntArray, delays_s: FloatArray, distance_m
     warmer = 0.5 * known.temperature_c / KELVIN
     deviation_s = np.sqrt(known.clock_s**2 + (apart_s * turned) ** 2 + (delays_s * warmer) ** 2)
     return np.asarray(np.minimum(DEVIATIONS * deviation_s, MAX_SHARE * spec.aperture_m / c_m_s))
+
+
+def _is_usual(known: Uncertainty) -> bool:
+    """Return whether a set-up is known at least as well as usual."""
+    usual = Uncertainty()
+    return all(getattr(known, each.name) <= getattr(usual, each.name) for each in fields(usual))
 
 
 def _upper_bound(evidence: Evidence) -> float:

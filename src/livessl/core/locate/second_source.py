@@ -16,7 +16,7 @@ import numpy as np
 from livessl.core.correlate.band import uses_envelope
 from livessl.core.geometry import Grid
 from livessl.core.locate import refine
-from livessl.core.locate.confidence import LEAST_CONFIDENCE, NEAR_M, Judgement, array_power
+from livessl.core.locate.confidence import AGREED, LEAST_CONFIDENCE, NEAR_M, Judgement, array_power
 from livessl.core.locate.estimator import Localization, Sound, strongest_onsets
 from livessl.core.locate.frame_gccs import FrameGCCs, Remainder
 from livessl.core.locate.outliers import Consensus
@@ -44,6 +44,17 @@ LEAST_PROSPECT: Final = 0.1
 CLEAR: Final = 1.0
 """Prominence of the second source in a frame from which the power of the frame is divided between both sources. Below
 it, the remainder may be reflections."""
+
+LEAST_EXPLAINED: Final = 0.55
+"""Share of the height of its pairs' GCCs that a second source explains at an array that clearly receives it."""
+
+RECEIVED: Final = 0.4
+"""The same, below which an array does not receive the second source. Arrays that disagree must all receive it: with two
+channels of one exchanged, each array alone receives one of two places."""
+
+AS_WELL: Final = 0.85
+"""Power of an array near the first source, as a share of that at the second, from which on the array alone cannot tell
+which of both places it receives."""
 
 UNEXPLAINED: Final = 0.05
 """Share of the height of the pairs' GCCs that a source may leave unexplained, because the lag axis is sampled."""
@@ -101,6 +112,11 @@ class TwoSources:
     first: Place
     second: Place
     features: SecondSourceFeatures
+
+    @property
+    def is_received_everywhere(self) -> bool:
+        """True if every array has a peak at both places, and receives the second source."""
+        return self.stand_out_everywhere and min(_explained(self.second)) >= RECEIVED
 
     @property
     def stand_out_everywhere(self) -> bool:
@@ -177,7 +193,8 @@ class SecondSourceSearch:
             frames = [frames_of(part) for part in used]
             found = self.find(first, frames)
             disputed = consensus.refused is not None or len(tried) > len(agreeing)
-            if found is not None and (found.stand_out_everywhere or not disputed):
+            agreed = not disputed and consensus.disagreement <= AGREED
+            if found is not None and (agreed or found.is_received_everywhere):
                 return self._separation(consensus, found, frames, keeps_first=not disputed)
         return None
 
@@ -231,7 +248,27 @@ class SecondSourceSearch:
         """
         found = self.most_likely(first, frames)
         apart = found.first.apart_m(found.second) >= APART_M
-        return found if apart and found.features.confidence >= LEAST_CONFIDENCE else None
+        if not apart or found.features.confidence < LEAST_CONFIDENCE or self._may_be_beside(found):
+            return None
+        return found
+
+    def _may_be_beside(self, found: TwoSources) -> bool:
+        """Return whether what arrays receive of the second source may come from near the first one.
+
+        That is so where half of the arrays or more hardly receive it, and the others alone as well from a place nearer
+        than `APART_M` to the first: two sources near one another, which an array receives from one direction, and a
+        place where its line of sight meets reflections at another array.
+        """
+        explained = _explained(found.second)
+        if 2 * sum(share >= LEAST_EXPLAINED for share in explained) > len(explained):
+            return False
+        near_m = _ball_m(found.first.position_m, self._grid)
+        terms = found.second.functional.pair_terms(found.second.position_m)
+        return all(
+            SRPFunctional([part], self._c_m_s).value(near_m).max() >= AS_WELL * array_power(part, term)
+            for part, term, share in zip(found.second.evidence, terms, explained, strict=True)
+            if share >= LEAST_EXPLAINED
+        )
 
     def most_likely(self, first: Place, frames: Sequence[FrameGCCs]) -> TwoSources:
         """Return the most likely pair of places, whether or not there is a second source.
@@ -267,7 +304,7 @@ class SecondSourceSearch:
         prominences = _prominences(remainders, chosen)
         above_all, above_noise = np.mean(prominences, axis=0)
         margin = refine.margin(chosen.power, chosen.rival_power)
-        return chosen, SecondSourceFeatures(above_all, above_noise, margin, _explained(chosen))
+        return chosen, SecondSourceFeatures(above_all, above_noise, margin, float(np.mean(_explained(chosen))))
 
     def _highest(self, evidence: tuple[Evidence, ...]) -> Place:
         """Search for the highest place of some evidence with one climb; it is not compared with other answers."""
@@ -295,11 +332,22 @@ class SecondSourceSearch:
         return chosen
 
 
-def _explained(place: Place) -> float:
-    """Return the power at a place relative to the highest possible power of an array's pairs; mean over the arrays."""
+def _ball_m(centre_m: FloatArray, grid: Grid) -> FloatArray:
+    """Return points of the search volume (N, 3), a grid's spacing apart and nearer than `APART_M` to a place."""
+    steps = int(APART_M / grid.spacing_m)
+    offsets_m = grid.spacing_m * np.arange(-steps, steps + 1)
+    axes = [offsets_m if axis in grid.free_axes else np.zeros(1) for axis in range(3)]
+    around_m = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    points_m = centre_m + around_m[np.linalg.norm(around_m, axis=1) < APART_M]
+    low_m, high_m = np.array(grid.bounds_m).T
+    return np.asarray(points_m[((points_m >= low_m) & (points_m <= high_m)).all(axis=1)])
+
+
+def _explained(place: Place) -> list[float]:
+    """Return the power of each array at a place relative to the highest possible power of its pairs."""
     terms = place.functional.pair_terms(place.position_m)
     each = zip(place.evidence, terms, strict=True)
-    return float(np.mean([array_power(part, term) / max(highest_power([part]), 1e-9) for part, term in each]))
+    return [array_power(part, term) / max(highest_power([part]), 1e-9) for part, term in each]
 
 
 def _prominences(remainders: Sequence[Remainder], place: Place) -> list[tuple[float, float]]:

@@ -22,8 +22,13 @@ RECENT_S: Final = 12.0
 event, its pre-roll and the way of a backfill request together."""
 
 WARM_UP_FRAMES: Final = 10
-"""Number of frames held back at the start. The quietest of them is the first estimate of the background, without the
-first frame if the device fades in there."""
+"""Number of frames held back where the background is unknown: at the start, and after digital silence that is not the
+background. The quietest of them is the first estimate of the background, without the first frame if the device fades in
+there."""
+
+DIGITAL_SILENCE: Final = 1e-14
+"""In-band power, full scale squared, below which a frame is digital silence: -140 dBFS. The noise of the best
+converters is 15 dB above it; zeros and other constants are below it."""
 
 FADE_IN: Final = 4.0
 """Ratio of the powers of the first frame's halves at and above which a device fades in: a sound must be as much louder
@@ -55,6 +60,10 @@ class Segmenter:
     Every frame index yields one message in order: a `Mark` while it is quiet, a `Frame` around sound. When sound
     begins, the pre-roll, whose frame indices were marked as quiet before, is sent as frames.
 
+    Drivers deliver zeros until a device runs. This digital silence is no measure of the background. The warm-up follows
+    it, unless the background is known from less than its window before. Digital silence that returns within this
+    window, as that of a noise gate or of a simulation without noise, is the background, until there is a gap.
+
     Parameters
     ----------
     spec : ArraySpec
@@ -79,6 +88,7 @@ class Segmenter:
         self._rate_hz = sample_rate_hz
         self._activity = CausalActivity(parameters)
         self._background = SteadyBackground(sample_rate_hz, spec.band_hz, parameters.floor_window_s, parameters.keep)
+        self._parameters = parameters
         self._hang_over = parameters.hang_over_frames
         self._warm_up: list[tuple[Cut, Measured]] | None = []
         self._pre_roll: deque[tuple[Cut, float]] = deque(maxlen=parameters.pre_roll_frames)
@@ -86,6 +96,10 @@ class Segmenter:
         self._quiet_frames = self._hang_over + 1
         self._sequence = 0
         self._frame_index: int | None = None
+        self._floor_frames = round(parameters.floor_window_s / FRAME_S)
+        self._silent_frames = 0
+        self._frames_since_silence: int | None = None  # None before the first since the start or a gap
+        self._is_silence_background = False
 
     @property
     def array(self) -> str:
@@ -115,27 +129,54 @@ class Segmenter:
             self._pre_roll.clear()  # frames before a gap are no pre-roll of a sound after it
             self._recent.clear()
             self._quiet_frames = self._hang_over + 1
+            self._frames_since_silence, self._is_silence_background = None, False
         self._frame_index = cut.frame_index
+        if measured.power < DIGITAL_SILENCE:
+            return self._take_silence(cut, measured, state)
+        if self._frames_since_silence is not None:
+            self._frames_since_silence += 1
+        return self._take_sound(cut, measured, state)
+
+    def _take_sound(self, cut: Cut, measured: Measured, state: FramerState) -> list[Message]:
         found_hum = self._background.learn(measured.spectrum)
         if self._warm_up is None:
             if found_hum:
                 self._activity.restart(self._background.usual_power, self._background.changing_maximum)
             level = self._background.changing_power(measured.spectrum, measured.power)
-            return self._decide(cut, measured, level, state)
+            return self._decide(cut, measured, level, state, active=self._activity.push(level))
         self._warm_up.append((cut, measured))
         return self.flush(state) if len(self._warm_up) >= WARM_UP_FRAMES else []
 
+    def _take_silence(self, cut: Cut, measured: Measured, state: FramerState) -> list[Message]:
+        """Take in a frame of digital silence, which is the background once it has returned soon."""
+        if self._frames_since_silence is not None and 0 < self._frames_since_silence <= self._floor_frames:
+            self._is_silence_background = True
+        self._silent_frames = 1 if self._frames_since_silence != 0 else self._silent_frames + 1
+        self._frames_since_silence = 0
+        messages = self._end_warm_up(state, 0.0) if self._warm_up else []
+        if self._is_silence_background:
+            self._warm_up = None
+            return messages + self._take_sound(cut, measured, state)
+        if messages or self._silent_frames == self._floor_frames:
+            self._activity, self._warm_up = CausalActivity(self._parameters), []
+        return messages + self._decide(cut, measured, measured.power, state, active=False)
+
     def flush(self, state: FramerState) -> list[Message]:
         """End the warm-up, as the end of a short stream must."""
+        return self._end_warm_up(state)
+
+    def _end_warm_up(self, state: FramerState, floor_power: float | None = None) -> list[Message]:
+        """Decide about the frames that are held back, over a known background or over that of the quietest of them."""
         held, self._warm_up = self._warm_up or [], None
         levels = [self._background.changing_power(known.spectrum, known.power) for _, known in held]
         if held:
             fades_in = len(held) > 1 and _fades_in(self._selected(held[0][0]))
-            self._activity.prime(min(levels[1:] if fades_in else levels))
+            quietest = min(levels[1:] if fades_in else levels)
+            self._activity.prime(quietest if floor_power is None else floor_power)
         return [
             message
             for (cut, known), level in zip(held, levels, strict=True)
-            for message in self._decide(cut, known, level, state)
+            for message in self._decide(cut, known, level, state, active=self._activity.push(level))
         ]
 
     def backfill(self, first: int, last: int) -> list[Message]:
@@ -145,9 +186,8 @@ class Segmenter:
     def _selected(self, cut: Cut) -> Float32Array:
         return cut.samples[self._channels]
 
-    def _decide(self, cut: Cut, measured: Measured, power: float, state: FramerState) -> list[Message]:
+    def _decide(self, cut: Cut, measured: Measured, power: float, state: FramerState, *, active: bool) -> list[Message]:
         self._recent.append((cut, power))
-        active = self._activity.push(power)
         self._quiet_frames = 0 if active else self._quiet_frames + 1
         if self._quiet_frames > self._hang_over:
             self._pre_roll.append((cut, power))
@@ -182,6 +222,10 @@ class Segmenter:
 
 
 def _fades_in(samples: Float32Array) -> bool:
-    """Return whether the second half of a first frame (channels, n) is much louder than the first, or all is zero."""
+    """Return whether the second half of a first frame (channels, n) is much louder than the first, or all is constant.
+
+    The mean of the first half plays no part: a driver may deliver another constant than zero.
+    """
     half = samples.shape[1] // 2
-    return bool(FADE_IN * np.square(samples[:, :half]).sum() <= np.square(samples[:, half : 2 * half]).sum())
+    power = np.square(samples - samples[:, :half].mean(axis=1, keepdims=True))
+    return bool(FADE_IN * power[:, :half].sum() <= power[:, half : 2 * half].sum())

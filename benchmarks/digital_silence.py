@@ -1,0 +1,145 @@
+"""Streams with digital silence: what is taken for sound in the noise after it, and which sounds are lost.
+
+`python benchmarks/digital_silence.py --events DIR [--streams N] [--seed S]`. The sounds between silences without any
+noise are those of DCASE 2016 task 2. The results are in docs/decisions/0080-digital-silence-is-no-background.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from livessl.core.stream.activity import ActivityParameters
+from livessl.core.stream.segmenter import Segmenter
+from livessl.core.stream.timeline import Framer
+from livessl.core.types import FRAME_NS, ArraySpec, Block, BoolArray, Float32Array, FloatArray, Frame
+from livessl.lab.evaluate.job import read_clips
+from livessl.lab.evaluate.paper import BAND_HZ, CLASSES
+
+RATE_HZ: Final = 16000
+FRAME: Final = 800
+START: Final = 20 * 1_700_000_000
+SPEC: Final = ArraySpec("array", 0.1 * np.vstack([np.zeros(3), np.eye(3)]), BAND_HZ)
+
+SILENCES_S: Final = (0.05, 0.13, 0.2, 0.5, 1.3, 2.9, 5.0)
+"""Digital silence at the start of a stream, in seconds."""
+
+ROOMS_S: Final = (0.05, 0.7, 2.0)
+"""Reverberation times, in seconds, of the sounds without noise."""
+
+CLIPS: Final = 5
+"""Sounds in a stream without noise."""
+
+
+def active_frames(samples: FloatArray) -> BoolArray:
+    """Return which frames of a stream (4, n) are sent as active: (F,)."""
+    framer = Framer(float(RATE_HZ))
+    segmenter = Segmenter(SPEC, np.arange(4), float(RATE_HZ), ActivityParameters())
+    messages = []
+    for index in range(0, samples.shape[1], 480):
+        block = Block(
+            index, samples[:, index : index + 480].astype(np.float32), START * FRAME_NS + index * 10**9 // RATE_HZ
+        )
+        messages += [message for cut in framer.push(block) for message in segmenter.push(cut, framer.state)]
+    messages += segmenter.flush(framer.state)
+    active = np.zeros(samples.shape[1] // FRAME + 1, dtype=np.bool_)
+    active[[m.frame_index - START for m in messages if isinstance(m, Frame) and m.active]] = True
+    return active
+
+
+def zeros(seconds: float) -> FloatArray:
+    """Return digital silence (4, n)."""
+    return np.zeros((4, round(seconds * RATE_HZ)))
+
+
+def noise(rng: np.random.Generator, seconds: float, level: float) -> FloatArray:
+    """Return steady noise (4, n), white or the low noise of a fan."""
+    count = round(seconds * RATE_HZ)
+    frequency_hz = np.fft.rfftfreq(count, 1.0 / RATE_HZ)
+    spectrum = np.fft.rfft(rng.standard_normal((4, count))) / np.maximum(frequency_hz, 100.0) ** rng.uniform(0.0, 0.8)
+    wave = np.fft.irfft(spectrum, count)
+    return np.asarray(level * wave / wave.std())
+
+
+def decaying(rng: np.random.Generator, seconds: float, rt60_s: float) -> FloatArray:
+    """Return noise (4, n) that decays by 60 dB in `rt60_s`."""
+    times_s = np.arange(round(seconds * RATE_HZ)) / RATE_HZ
+    return np.asarray(rng.standard_normal((4, len(times_s))) * 10.0 ** (-3.0 * times_s / rt60_s))
+
+
+def noise_after_silence(streams: int, seed: int, silence_s: float) -> str:
+    """Play silence, noise, and a burst 5 s later; return a row: false sounds, and bursts that are lost."""
+    false = lost = 0
+    for number in range(streams):
+        rng = np.random.default_rng([seed, number, round(1000 * silence_s)])
+        level = 10.0 ** (rng.uniform(-80.0, -30.0) / 20.0)
+        samples = np.concatenate([zeros(silence_s + rng.uniform(0.0, 0.05)), noise(rng, 8.0, level)], axis=1)
+        begin = samples.shape[1] - 3 * RATE_HZ
+        burst = 20.0 * level * decaying(rng, 0.4, 0.65)
+        samples[:, begin : begin + burst.shape[1]] += burst
+        active = active_frames(samples)
+        false += bool(active[: begin // FRAME - 1].any())
+        lost += not active[begin // FRAME : begin // FRAME + 3].any()
+    return f"| {silence_s:g} s of silence, then noise | {streams} | {false} | {lost} |"
+
+
+def clap_after_silence(streams: int, seed: int) -> str:
+    """Play silence and noise with a clap in its first half second; return a row: claps that go on, and lost ones."""
+    goes_on = lost = 0
+    for number in range(streams):
+        rng = np.random.default_rng([seed, number])
+        level, rt60_s, lead = 10.0 ** (rng.uniform(-80.0, -40.0) / 20.0), rng.uniform(0.1, 1.5), rng.uniform(0.0, 0.5)
+        sound = noise(rng, 6.0, level)
+        first = round(lead * RATE_HZ)
+        sound[:, first:] += 20.0 * level * decaying(rng, 7.0, rt60_s)[:, : sound.shape[1] - first]
+        silence = zeros(rng.uniform(0.1, 3.0))
+        active = active_frames(np.concatenate([silence, sound], axis=1))
+        begin = (silence.shape[1] + first) // FRAME
+        lost += not active[begin : begin + 2].any()
+        goes_on += bool(active[begin + round(0.5 * rt60_s * RATE_HZ / FRAME) + 8 :].any())
+    return f"| silence, then a clap in noise | {streams} | {goes_on} | {lost} |"
+
+
+def clips_in_silence(clips: Sequence[Float32Array], streams: int, seed: int, rt60_s: float) -> str:
+    """Play sounds with silence between them; return a row: streams whose first sound is lost, and all lost sounds."""
+    first = lost = 0
+    for number in range(streams):
+        rng = np.random.default_rng([seed, number, round(1000 * rt60_s)])
+        tail = 0.3 * decaying(rng, rt60_s, rt60_s)
+        tail[:, 0] = 3.0
+        parts, spans = [zeros(rng.uniform(0.1, 3.0))], []
+        for _ in range(CLIPS):
+            clip = clips[int(rng.integers(len(clips)))]
+            wet = np.stack([np.convolve(clip, one) for one in tail]) * 0.1 * 10.0 ** (rng.uniform(-20.0, 0.0) / 20.0)
+            begin = sum(part.shape[1] for part in parts)
+            spans.append(slice(begin // FRAME, (begin + wet.shape[1]) // FRAME + 1))
+            parts += [wet, zeros(rng.uniform(0.6, 5.0))]
+        active = active_frames(np.concatenate(parts, axis=1))
+        missed = [not active[span].any() for span in spans]
+        first, lost = first + missed[0], lost + sum(missed)
+    return f"| {CLIPS} sounds without noise, RT60 {rt60_s:g} s | {streams} | {first} | {lost} |"
+
+
+def main() -> None:
+    """Print a table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--events", type=Path, required=True, help="folder with the clips of DCASE 2016 task 2")
+    parser.add_argument("--streams", type=int, default=30, help="streams of each row (30)")
+    parser.add_argument("--seed", type=int, default=1)
+    given = parser.parse_args()
+    clips = [clip for each in read_clips(given.events, CLASSES, float(RATE_HZ)).values() for _, clip in each]
+    print("| | streams | with a false sound, a sound that goes on, or the first sound lost | sounds lost |")
+    print("|---|---|---|---|")
+    for silence_s in SILENCES_S:
+        print(noise_after_silence(given.streams, given.seed, silence_s), flush=True)
+    print(clap_after_silence(given.streams, given.seed), flush=True)
+    for rt60_s in ROOMS_S:
+        print(clips_in_silence(clips, given.streams, given.seed, rt60_s), flush=True)
+
+
+if __name__ == "__main__":
+    main()
