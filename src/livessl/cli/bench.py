@@ -14,7 +14,9 @@ from livessl.clock import SystemClock
 
 def add_arguments(parser: Any) -> None:
     """Describe the command's arguments."""
-    parser.add_argument("--live", action="store_true", help="measure a server under load instead of the kernels alone")
+    parser.add_argument(
+        "--live", action="store_true", help="measure a server under load instead of only the computation"
+    )
     only = parser.add_argument_group("with --live")
     only.add_argument(
         "--arrays",

@@ -91,7 +91,7 @@ COMMANDS: Final = (
     ),
     Command(
         "calibrate",
-        "verify a set-up and measure poses, by claps at places that you know or, with refine, by any sounds",
+        "verify a set-up, and measure where the arrays are, by claps at measured places or by any sounds",
         "livessl calibrate verify --session session/ --at 2,3,1.2 --at 6,8,1.2",
     ),
     Command(

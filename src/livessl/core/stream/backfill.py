@@ -34,8 +34,8 @@ MOST_REQUESTED_S: Final = 3.0
 cover its rest."""
 
 SHARE: Final = 0.25
-"""Largest share of an array's sound that is requested in the long run. At the start, `RECENT_S` of sound may be
-requested."""
+"""Share of the elapsed time by which an array's allowance of requested sound grows. The allowance begins at `RECENT_S`,
+which is also its most."""
 
 _RANK: Final = {Status.REFUSED: 0, Status.DIRECTION_ONLY: 1, Status.LOCATED: 2}
 
