@@ -141,14 +141,14 @@ def _ratios(peers: Json, exact: Json) -> Iterator[str]:
     yield "## In short"
     yield ""
     yield _item(
-        f"Computing the map of the 0.1 m grid takes {by_form['numba']:.1f} times as long as only reading its values from",
-        f"tables, one look-up for each pair and point ({by_form['NumPy']:.1f} times without numba).",
+        f"Computing the map of the 0.1 m grid takes {by_form['numba']:.1f} times as long as only reading its values",
+        f"from tables, one look-up for each pair and point ({by_form['NumPy']:.1f} times without numba).",
     )
     for name in ("pyroomacoustics", "acoular", "steering product, NumPy"):
         coarse, fine = (_number(_row(peers, name, spacing)["ratio"]) for spacing in (0.5, 0.1))
         yield _item(
-            f"From samples to the highest grid point of the summed map, *{name}* takes {coarse} times as long as livessl",
-            f"on a 0.5 m grid and {fine} times on a 0.1 m grid.",
+            f"From samples to the highest grid point of the summed map, *{name}* takes {coarse} times as long as",
+            f"livessl on a 0.5 m grid and {fine} times on a 0.1 m grid.",
         )
     ours, search = _row(peers, OURS, 0.1), _row(peers, "livessl, search, compiled", 0.1)
     yield _item(
@@ -163,8 +163,8 @@ def _side_by_side(peers: Json) -> Iterator[str]:
     yield _paragraph(
         f"All codes run in turn, in one process, on one thread, for {peers['rounds']} rounds: from samples through the",
         f"summed map to its highest grid point. The ratio is relative to *{OURS}*. *Correlation* is that of the code's",
-        f"map with the one of the plain formula, the lowest of {peers['checked']} blocks; *same peak* is the number of these blocks on",
-        "which the highest grid point is that of the formula. Imports and tables are not counted.",
+        f"map with the one of the plain formula, the lowest of {peers['checked']} blocks; *same peak* is the number of",
+        "these blocks on which the highest grid point is that of the formula. Imports and tables are not counted.",
     )
     yield ""
     rows = []
@@ -195,7 +195,8 @@ def _exactness(exact: Json) -> Iterator[str]:
     yield "## The same grid point as the whole map"
     yield ""
     yield _paragraph(
-        f"On {exact['same']} of {exact['maps']} maps the search finds the grid point and value of the whole map: 2 to {exact['most_arrays']} arrays, a voice, two voices and noise,",
+        f"On {exact['same']} of {exact['maps']} maps the search finds the grid point and value of the whole map: 2 to",
+        f"{exact['most_arrays']} arrays, a voice, two voices and noise,",
         "grids of 0.1 and 0.05 m.",
     )
 
@@ -206,8 +207,8 @@ def _kernels(measured: Json) -> Iterator[str]:
     yield _paragraph(
         f"{measured['kernels']}, {measured['rounds']} rounds; a bare look-up takes {measured['lookup_ns']:.2f} ns. The",
         "ratio is relative to the time of as many bare look-ups. *In turn*: each row is timed after all others,",
-        "when the caches hold the data of those. *Again*: it is timed once more at once, with the next block, as when one",
-        "recording is processed.",
+        "when the caches hold the data of those. *Again*: it is timed once more at once, with the next block, as when",
+        "one recording is processed.",
     )
     yield ""
     yield from _table(
