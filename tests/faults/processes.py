@@ -232,6 +232,11 @@ class Playing:
         events = [json.loads(text) for (text,) in rows]
         return [{**event, "at_s": (utc_ns(event["time_utc"]) - self.start_ns) / 1e9} for event in events]
 
+    def awaits_final_results(self) -> bool:
+        """Whether the final pass may still replace a stored event."""
+        with closing(sqlite3.connect(self.directory / "events.db", timeout=HANG_S)) as db:
+            return bool(db.execute("SELECT 1 FROM early LIMIT 1").fetchall())
+
 
 class Hearer:
     """Subscribes to events and notes how long after each sound's end the first word of it came.
