@@ -66,6 +66,20 @@ def test_quiet_voice_after_a_loud_door_is_speech(detector: SpeechDetector) -> No
     assert detector.has_speech([(both[None], RATE_HZ)])
 
 
+@pytest.mark.parametrize("below", ["hum of 50 Hz", "hum of 60 Hz", "a constant offset"])
+def test_voice_in_much_louder_sound_of_low_frequency_is_speech(detector: SpeechDetector, below: str) -> None:
+    spoken = in_quiet(voice(np.random.default_rng(2), RATE_HZ), noise_seed=3)
+    spoken /= np.abs(spoken).max()
+    time_s = np.arange(len(spoken)) / RATE_HZ
+    others = {
+        "hum of 50 Hz": np.cos(2 * np.pi * 50.0 * time_s),
+        "hum of 60 Hz": np.cos(2 * np.pi * 60.0 * time_s),
+        "a constant offset": np.ones(len(spoken)),
+    }
+    both = np.float32(0.9) * others[below].astype(np.float32) + np.float32(0.01) * spoken  # 39 dB above the voice
+    assert detector.has_speech([(both[None], RATE_HZ)])
+
+
 def test_silence_needs_no_detector() -> None:
     detector = SpeechDetector((sys.executable, "-c", "raise SystemExit(1)"))
     assert not detector.has_speech([(np.zeros((4, 16000), dtype=np.float32), RATE_HZ)])
