@@ -242,12 +242,19 @@ class Clips:
         job = self._waiting.due(self._clock.monotonic_ns())
         if job is None:
             return False
-        if self._overload.relief.arrays is None:
+        if self._overload.relief.arrays is None and not self._comes_too_late(job):
             self._write(job)
         else:
             self._outcomes.left_out(job.event, MissingReason.SHED)
-        self._waiting.done()
+        self._waiting.done(job)
         return True
+
+    def _comes_too_late(self, job: Job) -> bool:
+        """Return whether frames of a refused event were released while it waited behind others."""
+        return job.event.status is Status.REFUSED and any(
+            self._ring.has_released(name, job.event.start_ns + job.ahead[name].ns)
+            for name in _arrays_of(job.event) & job.ahead.keys()
+        )
 
     def _write(self, job: Job) -> None:
         event = job.event
