@@ -26,6 +26,7 @@ def test_file_of_reasons_that_can_be_written_again_is_no_problem_any_more(tmp_pa
     desk.work()
     assert [problem for problem in desk.clips.problems if problem.startswith("missing.jsonl in server.clips.folder: ")]
     path.rmdir()
+    desk.clock.ns += service.EXPIRE_NS
     desk.work()
     assert desk.clips.problems == []
     assert path.read_text().count("small-0") == 1

@@ -57,6 +57,7 @@ STOP_S: Final = 5.0
 """Longest wait, in seconds, for the thread when the server stops."""
 
 WITHOUT_REASONS: Final = "it is not known why earlier events have no clip"
+UNSAVED_REASONS: Final = "it is not stored why events have no clip"
 
 _log = logging.getLogger(__name__)
 
@@ -229,7 +230,6 @@ class Clips:
             with suppress(OSError):  # a system that does not know priorities of threads
                 os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)
             self.folder.load()
-            self._trouble.report_of(Subject.READING_REASONS, WITHOUT_REASONS, self._outcomes.missing.load)
             while not self._stop.is_set():
                 if not self.work():
                     self._stop.wait(POLL_S)
@@ -240,10 +240,9 @@ class Clips:
 
     def work(self) -> bool:
         """Delete what is old, and write the clip of one event; return whether there was one. The thread calls it."""
+        self._trouble.report_of(Subject.READING_REASONS, WITHOUT_REASONS, self._outcomes.missing.load)
         self._expire()
-        self._trouble.report_of(
-            Subject.SAVING_REASONS, "it is not stored why events have no clip", self._outcomes.missing.save
-        )
+        self._trouble.report_of(Subject.SAVING_REASONS, UNSAVED_REASONS, self._outcomes.missing.save)
         job = self._waiting.due(self._clock.monotonic_ns())
         if job is None:
             return False
