@@ -51,7 +51,7 @@ EXPIRE_NS: Final = 60_000_000_000
 DAY_NS: Final = 86_400_000_000_000
 
 NICENESS: Final = 10
-"""Niceness of the thread: it works when nothing else does."""
+"""Niceness of the thread: the localization comes first."""
 
 STOP_S: Final = 5.0
 """Longest wait, in seconds, for the thread when the server stops."""

@@ -28,7 +28,7 @@ WITHOUT_DETECTOR: Final = 69
 """Exit code if the package with the detector cannot be imported: EX_UNAVAILABLE of sysexits.h."""
 
 NICENESS: Final = 10
-"""Niceness of the process: it works when nothing else does."""
+"""Niceness of the process: the localization comes first."""
 
 
 def read_exactly(file: IO[bytes], count: int) -> bytes | None:
