@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -58,14 +60,21 @@ def test_kill_while_the_file_is_replaced_loses_no_reason_and_the_old_file_is_era
 ) -> None:
     found, steps = noted(tmp_path, *range(5)), iter(range(10))
 
-    def stop_at(path: Path) -> None:
+    def killed_at_a_step(act: Callable[..., None]) -> Callable[..., None]:
+        def wrapped(*arguments: Any) -> None:
+            stop_at_the_step()
+            act(*arguments)
+            stop_at_the_step()
+
+        return wrapped
+
+    def stop_at_the_step() -> None:
         if next(steps) == step:
-            raise KilledError(path)
+            raise KilledError
 
     with monkeypatch.context() as patch:
         for name in ("write_through", "overwrite"):
-            act = getattr(missing, name)
-            patch.setattr(missing, name, lambda path, *more, act=act: (stop_at(path), act(path, *more), stop_at(path)))
+            patch.setattr(missing, name, killed_at_a_step(getattr(missing, name)))
         with pytest.raises(KilledError):
             found.expire(2)
     assert known(tmp_path, 2, 3, 4) == [True] * 3
