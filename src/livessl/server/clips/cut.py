@@ -26,7 +26,8 @@ class CutFrame:
     Parameters
     ----------
     frame_index : int
-        Index on the joint grid of frames: the known offset of the array's clock is subtracted.
+        Index on the joint grid of frames, from which the known offset of the array's clock, in whole frames, is
+        subtracted.
     begin, length : int
         Number of its first sample in the recording, and number of its samples.
     power : float
@@ -104,7 +105,8 @@ def cut(spec: ArraySpec, frames: Sequence[Frame], offset_ns: int = 0, frames_ahe
     offset_ns : int
         How far the array's clock is ahead.
     frames_ahead : int
-        Whole frames of that by which the fusion corrects the array's frame indices.
+        The part of `offset_ns`, in whole frames, by which the fusion corrects the array's frame indices. The indices of
+        `frames` are not corrected.
 
     Returns
     -------

@@ -46,8 +46,8 @@ class ClipFolder(ClipReader):
     def load(self) -> None:
         """Read what is there, and delete what a killed server has left unfinished; what fails is left, and logged.
 
-        Unreadable clips count with the size of their files and the time of `clip.json`. Age and room delete those that
-        say that they are not kept for ever; where that is unknown, they stay.
+        Unreadable clips count with the size of their files and the time of `clip.json`. Those that say that they are
+        not kept for ever are deleted for their age or to stay below `max_bytes`; where that is unknown, they stay.
         """
         try:
             folders = sorted(self._path.iterdir())

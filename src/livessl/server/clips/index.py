@@ -58,7 +58,7 @@ class Figures:
     kept : int
         Clips that are kept for ever.
     kept_bytes : int
-        Bytes of the clips that neither age nor room deletes: they are kept for ever, or may be.
+        Bytes of the clips that are deleted neither for their age nor to make room: they are kept for ever, or may be.
     unreadable : int
         Clips that could not be read when they were last needed.
     """

@@ -50,8 +50,9 @@ class UnreadableClipError(RunError):
     @staticmethod
     def _text(event_id: str, what: str) -> str:
         return (
-            f"event {event_id!r}: expected a {ABOUT} that this release can read, got another one: {what}; it is "
-            "damaged or of another release: locate its sound with `livessl locate --wav ARRAY=FILE`, or delete them"
+            f"event {event_id!r}: expected a {ABOUT} that this release can read, got another one: {what}; the file "
+            "is damaged or of another release. Locate the event from its recordings with `livessl locate --wav "
+            "ARRAY=FILE`, or delete the recordings"
         )
 
 
@@ -130,7 +131,10 @@ class ClipReader:
         try:
             return sorted(folder.name for folder in self._path.iterdir() if self.has(folder.name))
         except OSError as error:
-            raise ClipsError(f"{self._path}: expected a folder of clips: {error.strerror or error}; name it") from error
+            raise ClipsError(
+                f"{self._path}: expected a folder of clips: {error.strerror or error}; give the folder of the clips as "
+                "the command's argument, or correct `server.clips.folder`"
+            ) from error
 
     def has(self, event_id: str) -> bool:
         """Return whether an event has a clip, which may be unreadable."""

@@ -28,6 +28,7 @@ class FrameRing:
         self._lock = threading.Lock()
         self._frames: dict[str, dict[int, Frame]] = {}
         self._came: deque[Frame] = deque()
+        self._released_ns: dict[str, int] = {}  # time of the frame that was dropped last, by array
         self.nbytes = 0
         """Memory of the samples that are held, in bytes."""
         self.dropped = 0
@@ -59,6 +60,11 @@ class FrameRing:
             found = [frame for frame in self._frames.get(array, {}).values() if begin_ns <= frame.time_ns < end_ns]
         return sorted(found, key=lambda frame: frame.frame_index)
 
+    def has_released(self, array: str, time_ns: int) -> bool:
+        """Return whether the frame of an array that was dropped last began at a time of its own clock, or later."""
+        with self._lock:
+            return array in self._released_ns and self._released_ns[array] >= time_ns
+
     def clear(self) -> None:
         """Drop all frames."""
         with self._lock:
@@ -77,3 +83,4 @@ class FrameRing:
         frame = self._came.popleft()
         del self._frames[frame.array][frame.frame_index]
         self.nbytes -= frame.samples.nbytes
+        self._released_ns[frame.array] = frame.time_ns

@@ -5,25 +5,26 @@ from __future__ import annotations
 import logging
 import os
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Final
 
 from livessl.clock import Clock
 from livessl.core.stream.clock_offsets import ClockOffsets
-from livessl.core.types import FRAME_NS, FRAME_S, Event, Message, Status
+from livessl.core.types import FRAME_NS, FRAME_S, ArraySpec, Event, Message, Status
 from livessl.schema.clips import MissingReason
 from livessl.server.api.encode import JsonObject
 from livessl.server.clips.cut import Cut, cut
 from livessl.server.clips.folder import ClipFolder
 from livessl.server.clips.index import Figures
 from livessl.server.clips.outcomes import Counts, Outcomes
-from livessl.server.clips.record import ENHANCED, Recipe, make_clip, write_clip
+from livessl.server.clips.record import ENHANCED, Made, Recipe, make_clip, write_clip
 from livessl.server.clips.ring import FrameRing
 from livessl.server.clips.speech import SpeechDetector, SpeechError
-from livessl.server.clips.trouble import Trouble
+from livessl.server.clips.trouble import Subject, Trouble
 from livessl.server.clips.waiting import Ahead, Job, WaitingEvents
 from livessl.server.overload import Overload
 from livessl.server.site_time import SiteTime
@@ -50,10 +51,13 @@ EXPIRE_NS: Final = 60_000_000_000
 DAY_NS: Final = 86_400_000_000_000
 
 NICENESS: Final = 10
-"""Niceness of the thread: it works when nothing else does."""
+"""Niceness of the thread: the localization comes first."""
 
 STOP_S: Final = 5.0
 """Longest wait, in seconds, for the thread when the server stops."""
+
+WITHOUT_REASONS: Final = "it is not known why earlier events have no clip"
+UNSAVED_REASONS: Final = "it is not stored why events have no clip"
 
 _log = logging.getLogger(__name__)
 
@@ -226,7 +230,6 @@ class Clips:
             with suppress(OSError):  # a system that does not know priorities of threads
                 os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)
             self.folder.load()
-            self._trouble.report_of("it is not known why earlier events have no clip", self._outcomes.missing.load)
             while not self._stop.is_set():
                 if not self.work():
                     self._stop.wait(POLL_S)
@@ -237,51 +240,47 @@ class Clips:
 
     def work(self) -> bool:
         """Delete what is old, and write the clip of one event; return whether there was one. The thread calls it."""
+        self._trouble.report_of(Subject.READING_REASONS, WITHOUT_REASONS, self._outcomes.missing.load)
         self._expire()
-        self._trouble.report_of("it is not stored why events have no clip", self._outcomes.missing.save)
+        self._trouble.report_of(Subject.SAVING_REASONS, UNSAVED_REASONS, self._outcomes.missing.save)
         job = self._waiting.due(self._clock.monotonic_ns())
         if job is None:
             return False
-        if self._overload.relief.arrays is None:
+        if self._overload.relief.arrays is None and not _comes_too_late(job, self._ring):
             self._write(job)
         else:
             self._outcomes.left_out(job.event, MissingReason.SHED)
-        self._waiting.done()
+        self._waiting.done(job)
         return True
 
     def _write(self, job: Job) -> None:
         event = job.event
         try:
-            cuts = self._cuts(job)
+            cuts = _cuts(job, self._ring, self._specs, self._config)
             if not cuts:
                 self._outcomes.left_out(event, MissingReason.WITHOUT_SOUND)
                 return
             made = make_clip(Recipe(event, tuple(cuts), self._config.enhanced, self._site.c_m_s))
-            sounds = ((one.samples, one.sample_rate_hz) for one in made.recordings)
-            if self._speech is not None and self._speech.has_speech(sounds):
+            if self._has_speech(made):
+                self._trouble.clear(Subject.MAKING)
                 self._outcomes.left_out(event, MissingReason.SPEECH)
                 return
-            self.folder.put(event.id, lambda partial: write_clip(made, partial))
+            self.folder.put(event.id, lambda folder: write_clip(made, folder))
         except Exception as error:  # noqa: BLE001 - whatever one event has about it, the next one gets its clip
             if not self._stop.is_set():
                 self._outcomes.left_out(event, MissingReason.FAILED)
-                self._trouble.report(_failure(event, error))
+                self._trouble.report(*_failure(event, error))
             return
         self._outcomes.written(is_complete=not any(lacks(each, event) for each in cuts))
-        self._trouble.clear()
+        self._trouble.clear(Subject.MAKING, Subject.STORING)
         self._expired_ns = None  # there may be too many bytes now
 
-    def _cuts(self, job: Job) -> list[Cut]:
-        begin_ns = job.event.start_ns - round(1e9 * self._config.pre_s)
-        end_ns = job.event.end_ns + round(1e9 * self._config.post_s)
-        found, own = [], _arrays_of(job.event)
-        for name, at in job.ahead.items():
-            if name in self._specs and (name in own or job.event.status is Status.REFUSED):
-                frames = self._ring.between(name, begin_ns + at.ns, end_ns + at.ns)
-                # frames that were requested for a refused event are a part of why it was refused
-                if name in own or any(frame.requested for frame in frames):
-                    found.append(cut(self._specs[name], frames, at.ns, at.frames))
-        return [each for each in found if each is not None]
+    def _has_speech(self, made: Made) -> bool:
+        if self._speech is None:
+            return False
+        found = self._speech.has_speech((one.samples, one.sample_rate_hz) for one in made.recordings)
+        self._trouble.clear(Subject.DETECTING)
+        return found
 
     def _expire(self) -> None:
         now_ns = self._clock.monotonic_ns()
@@ -291,13 +290,14 @@ class Clips:
         limits = (self._config.max_age_days, self._site.store.retention_days)
         days = min((limit for limit in limits if limit is not None), default=None)
         before_ns = None if days is None else self._clock.now_ns() - round(days * DAY_NS)
-        attempts: tuple[tuple[str, Callable[[], None]], ...] = (
-            ("deleted clips were not erased", self.folder.erase_left),
-            ("it is still noted why old events have no clip", lambda: self._outcomes.missing.expire(before_ns)),
-            ("old clips were not deleted", lambda: self._delete_old(before_ns)),
+        expire_reasons = partial(self._outcomes.missing.expire, before_ns)
+        attempts: tuple[tuple[Subject, str, Callable[[], None]], ...] = (
+            (Subject.ERASING, "deleted clips were not erased", self.folder.erase_left),
+            (Subject.EXPIRING_REASONS, "it is still noted why old events have no clip", expire_reasons),
+            (Subject.DELETING, "old clips were not deleted", partial(self._delete_old, before_ns)),
         )
-        for what, act in attempts:
-            self._trouble.report_of(what, act)
+        for subject, what, act in attempts:
+            self._trouble.report_of(subject, what, act)
 
     def _delete_old(self, before_ns: int | None) -> None:
         self._outcomes.deleted(self.folder.expire(before_ns, self._config.max_bytes))
@@ -308,14 +308,36 @@ def _arrays_of(event: Event) -> set[str]:
     return {*event.heard_by, *(() if event.estimate is None else event.estimate.arrays)}
 
 
-def _failure(event: Event, error: Exception) -> str:
-    """Return a sentence about an error that has prevented a clip."""
+def _comes_too_late(job: Job, ring: FrameRing) -> bool:
+    """Return whether frames of a refused event were released while it waited behind others."""
+    return job.event.status is Status.REFUSED and any(
+        ring.has_released(name, job.event.start_ns + job.ahead[name].ns)
+        for name in _arrays_of(job.event) & job.ahead.keys()
+    )
+
+
+def _cuts(job: Job, ring: FrameRing, specs: Mapping[str, ArraySpec], config: ClipsConfig) -> list[Cut]:
+    """Return what each array has recorded around an event."""
+    begin_ns = job.event.start_ns - round(1e9 * config.pre_s)
+    end_ns = job.event.end_ns + round(1e9 * config.post_s)
+    found, own = [], _arrays_of(job.event)
+    for name, at in job.ahead.items():
+        if name in specs and (name in own or job.event.status is Status.REFUSED):
+            frames = ring.between(name, begin_ns + at.ns, end_ns + at.ns)
+            # frames that were requested for a refused event are a part of why it was refused
+            if name in own or any(frame.requested for frame in frames):
+                found.append(cut(specs[name], frames, at.ns, at.frames))
+    return [each for each in found if each is not None]
+
+
+def _failure(event: Event, error: Exception) -> tuple[Subject, str]:
+    """Return what an error that has prevented a clip is about, and a sentence about it."""
     if isinstance(error, OSError):
-        return f"the clip of {event.id!r} was not stored: {error.strerror or error}; free some space"
+        return Subject.STORING, f"the clip of {event.id!r} was not stored: {error.strerror or error}; free some space"
     if isinstance(error, SpeechError):
-        return f"the clip of {event.id!r} was not stored, for it may contain speech: {error}"
+        return Subject.DETECTING, f"the clip of {event.id!r} was not stored, for it may contain speech: {error}"
     _log.debug("the clip of %r failed", event.id, exc_info=error)
-    return (
+    return Subject.MAKING, (
         f"the clip of {event.id!r} was not made: {type(error).__name__}: {error}; report this as a bug, and set the "
         "clips' enhanced to false if it occurs again"
     )

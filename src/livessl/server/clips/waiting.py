@@ -1,4 +1,4 @@
-"""Events that wait for their clips, in the order in which they came."""
+"""Events that wait for their clips, in the order in which they came, but refused ones last."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections import deque
 from dataclasses import dataclass
 
 from livessl.core.stream.clock_offsets import ClockOffsets
-from livessl.core.types import FRAME_S, Event
+from livessl.core.types import FRAME_S, Event, Status
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,31 +34,40 @@ class Job:
 
 
 class WaitingEvents:
-    """A queue of events. Every thread may call it; the thread of the clips alone takes them away."""
+    """Two queues of events: refused ones come last. Every thread may call it; that of the clips alone takes them away.
+
+    The fusion releases frames after some time. A refused event in front of a located one could delay it until then.
+    """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._jobs: deque[Job] = deque()
+        self._first: deque[Job] = deque()
+        self._refused: deque[Job] = deque()
 
     def __len__(self) -> int:
-        return len(self._jobs)
+        return len(self._first) + len(self._refused)
 
     def __contains__(self, event_id: str) -> bool:
         with self._lock:
-            return any(job.event.id == event_id for job in self._jobs)
+            return any(job.event.id == event_id for jobs in (self._first, self._refused) for job in jobs)
 
     def put(self, job: Job) -> None:
         """Let an event wait."""
         with self._lock:
-            self._jobs.append(job)
+            self._queue_of(job).append(job)
 
     def due(self, now_ns: int) -> Job | None:
-        """Return the first event if its time has come; it still waits."""
+        """Return the next event whose time has come, refused ones last; it still waits."""
         with self._lock:
-            job = self._jobs[0] if self._jobs else None
-        return None if job is None or job.due_ns > now_ns else job
+            for jobs in (self._first, self._refused):
+                if jobs and jobs[0].due_ns <= now_ns:
+                    return jobs[0]
+        return None
 
-    def done(self) -> None:
-        """Take the first event away; until then it counts as waiting."""
+    def done(self, job: Job) -> None:
+        """Take an event away that `due` has returned; until then it counts as waiting."""
         with self._lock:
-            self._jobs.popleft()
+            self._queue_of(job).popleft()
+
+    def _queue_of(self, job: Job) -> deque[Job]:
+        return self._refused if job.event.status is Status.REFUSED else self._first
