@@ -38,12 +38,16 @@ divided by the largest sample within it."""
 SILENCE: Final = 1e-4
 """Level, relative to the recording's peak, below which it is not made louder: 80 dB down a voice cannot be heard."""
 
-HIGH_PASS_HZ: Final = 100.0
-"""Cutoff frequency, in hertz, below which a channel is attenuated before it is levelled: hum of the mains, rumble and a
+SPLIT_HZ: Final = 120.0
+"""Frequency, in hertz, below which sound is limited before a channel is levelled: hum of the mains, rumble and a
 constant offset would otherwise set the level. Most of a voice is above it."""
 
-HIGH_PASS_ORDER: Final = 4
-"""Order of the high-pass filter, which runs forward and backward: 48 dB less at 50 Hz, and 36 dB at 60 Hz."""
+SPLIT_ORDER: Final = 4
+"""Order of the high-pass filter that splits a channel; it runs forward and backward."""
+
+MOST_LOW: Final = 2.0
+"""Largest level of the low frequencies, relative to that of the others at the same moment. Without any, doors resemble
+voices."""
 
 _PADDING_S: Final = 0.2
 """Time, in seconds, by which the signal is mirrored at its ends, so that the filter has settled where it begins."""
@@ -74,7 +78,7 @@ def is_speech(probabilities: FloatArray) -> bool:
 
 
 def levelled(samples: Float32Array, sample_rate_hz: float) -> Float32Array:
-    """Return a channel as the detector needs it: at `RATE_HZ`, without low frequencies, and equally loud throughout.
+    """Return a channel as the detector needs it: at `RATE_HZ`, with limited low frequencies, and equally loud.
 
     Parameters
     ----------
@@ -92,29 +96,36 @@ def levelled(samples: Float32Array, sample_rate_hz: float) -> Float32Array:
     SpeechError
         If a sample is not a finite number.
     """
-    from scipy.ndimage import maximum_filter1d, uniform_filter1d  # most servers never need it
-
     if not np.isfinite(samples).all():
         raise SpeechError("a channel has values that are not finite numbers; check the array's device and its driver")
     if not samples.any():
         return np.zeros(0, dtype=np.float32)
-    signal = resampled(_high_passed(np.asarray(samples, dtype=np.float64), sample_rate_hz), sample_rate_hz, RATE_HZ)
+    signal = resampled(_limited(np.asarray(samples, dtype=np.float64), sample_rate_hz), sample_rate_hz, RATE_HZ)
     peak = float(np.abs(signal).max(initial=0.0))
     if peak == 0.0:
         return np.zeros(0, dtype=np.float32)
     signal = np.pad(signal, (0, -len(signal) % CHUNK))
-    reach = round(LEVELLED_S * RATE_HZ)
-    level = uniform_filter1d(maximum_filter1d(np.abs(signal), 2 * reach + 1), reach)
-    return np.asarray(PEAK * signal / np.maximum(level, SILENCE * peak), dtype=np.float32)
+    return np.asarray(PEAK * signal / np.maximum(_level(signal, RATE_HZ), SILENCE * peak), dtype=np.float32)
 
 
-def _high_passed(signal: FloatArray, sample_rate_hz: float) -> FloatArray:
-    """Return a signal (n,), n > 0, without its frequencies below `HIGH_PASS_HZ`; it is not delayed."""
+def _limited(signal: FloatArray, sample_rate_hz: float) -> FloatArray:
+    """Return a signal (n,), n > 0, whose part below `SPLIT_HZ` is `MOST_LOW` times as loud as the rest at most."""
     from scipy.signal import butter, sosfiltfilt
 
-    sections = butter(HIGH_PASS_ORDER, HIGH_PASS_HZ, "highpass", fs=sample_rate_hz, output="sos")
+    sections = butter(SPLIT_ORDER, SPLIT_HZ, "highpass", fs=sample_rate_hz, output="sos")
     padding = min(round(_PADDING_S * sample_rate_hz), len(signal) - 1)
-    return np.asarray(sosfiltfilt(sections, signal, padtype="even", padlen=padding), dtype=np.float64)
+    high = np.asarray(sosfiltfilt(sections, signal, padtype="even", padlen=padding), dtype=np.float64)
+    low = signal - high  # the filter delays nothing
+    most = MOST_LOW * _level(high, sample_rate_hz)
+    return high + low * np.minimum(1.0, most / np.maximum(_level(low, sample_rate_hz), np.finfo(np.float64).tiny))
+
+
+def _level(signal: FloatArray, sample_rate_hz: float) -> FloatArray:
+    """Return the largest magnitude of a signal (n,) within `LEVELLED_S` of each sample, smoothed."""
+    from scipy.ndimage import maximum_filter1d, uniform_filter1d  # most servers never need it
+
+    reach = round(LEVELLED_S * sample_rate_hz)
+    return np.asarray(uniform_filter1d(maximum_filter1d(np.abs(signal), 2 * reach + 1), reach), dtype=np.float64)
 
 
 def _end_of(process: subprocess.Popen[bytes]) -> str:
