@@ -30,7 +30,7 @@ from livessl.core.enhance.enhance import Enhancement, plan
 from livessl.core.geometry import tetrahedron
 from livessl.core.types import ArraySpec, Float32Array, FloatArray
 from livessl.simulation.room import impulse_responses
-from livessl.simulation.scene import make_scene, synthesised_sounds
+from livessl.simulation.scene import NamedSound, Source, make_scene, synthesised_sounds
 
 ROOM_M: Final = (8.0, 10.0, 4.0)
 CENTRES_M: Final = ((4.0, 2.5, 2.0), (4.0, 7.5, 2.0))
@@ -121,17 +121,22 @@ def microphones_m() -> FloatArray:
     return np.concatenate([spec.microphones_m for spec in specs()])
 
 
-def scenes(positions: int, rt60_s: float, seed: int) -> Iterator[Scene]:
-    """Yield sounds at random places in a room."""
-    sounds = synthesised_sounds(RATE_HZ, seed)
+def placed(sounds: Sequence[NamedSound], count: int, rt60_s: float, seed: int) -> Iterator[tuple[Source, Float32Array]]:
+    """Yield sounds at random places, and the impulse responses (8, L) from there to all microphones."""
     made = make_scene(
-        ROOM_M, rt60_s=rt60_s, sounds=sounds, count=positions, sample_rate_hz=RATE_HZ, c_m_s=C_M_S,
+        ROOM_M, rt60_s=rt60_s, sounds=sounds, count=count, sample_rate_hz=RATE_HZ, c_m_s=C_M_S,
         keep_away_m=np.array(CENTRES_M), seed=seed,
     )  # fmt: skip
     for source in made.sources:
-        responses = impulse_responses(
+        (responses,) = impulse_responses(
             ROOM_M, source.position_m, microphones_m(), [rt60_s], sample_rate_hz=RATE_HZ, c_m_s=C_M_S, compiled=True
-        )[0]
+        )
+        yield source, responses
+
+
+def scenes(positions: int, rt60_s: float, seed: int) -> Iterator[Scene]:
+    """Yield sounds at random places in a room."""
+    for source, responses in placed(synthesised_sounds(RATE_HZ, seed), positions, rt60_s, seed):
         direct_s = np.linalg.norm(microphones_m() - source.position_m, axis=1) / C_M_S
         edges = np.round((direct_s + EARLY_S) * RATE_HZ).astype(int)
         is_early = np.arange(responses.shape[1]) < edges[:, None]

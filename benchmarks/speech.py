@@ -22,13 +22,12 @@ from scipy.signal import oaconvolve
 from tqdm import tqdm
 
 import claps
-from clips import C_M_S, CENTRES_M, PRE_ROLL_S, RATE_HZ, ROOM_M, TAIL_S, microphones_m
+from clips import PRE_ROLL_S, RATE_HZ, TAIL_S, placed
 from livessl.core.types import Float32Array, FloatArray
 from livessl.server.clips.speech import LEAST_CHUNKS, LEAST_PROBABILITY, WINDOW, SpeechDetector
 from livessl.server.clips.speech_main import CHUNK
 from livessl.server.clips.speech_main import RATE_HZ as DETECTOR_HZ
-from livessl.simulation.room import impulse_responses
-from livessl.simulation.scene import NamedSound, make_scene, read_sounds, synthesised_sounds
+from livessl.simulation.scene import NamedSound, read_sounds, synthesised_sounds
 from recordings import DATA, TALKERS
 
 RT60_S: Final = 0.7
@@ -76,14 +75,7 @@ class Row:
 
 def in_room(sounds: Sequence[NamedSound], count: int, seed: int) -> Iterator[tuple[str, Float32Array]]:
     """Yield the names of sounds, and what all microphones (8, n) receive of each at a random place, without noise."""
-    made = make_scene(
-        ROOM_M, rt60_s=RT60_S, sounds=sounds, count=count, sample_rate_hz=RATE_HZ, c_m_s=C_M_S,
-        keep_away_m=np.array(CENTRES_M), seed=seed,
-    )  # fmt: skip
-    for source in made.sources:
-        responses = impulse_responses(
-            ROOM_M, source.position_m, microphones_m(), [RT60_S], sample_rate_hz=RATE_HZ, c_m_s=C_M_S, compiled=True
-        )[0]
+    for source, responses in placed(sounds, count, RT60_S, seed):
         before, after = round(PRE_ROLL_S * RATE_HZ), round(TAIL_S * RATE_HZ)
         wet = oaconvolve(responses, source.sound[None], axes=1)[:, : len(source.sound) + after]
         yield source.name, np.pad(wet, ((0, 0), (before, 0))).astype(np.float32)

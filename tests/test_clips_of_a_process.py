@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
@@ -44,32 +45,48 @@ def made(figures: dict[str, Any]) -> int:
 pytestmark = [pytest.mark.processes, pytest.mark.timeout(240)]
 
 
-def test_clips_of_a_killed_server_are_there_after_its_restart(tmp_path: Path) -> None:
-    port, endpoint = free_port(), f"tcp://127.0.0.1:{free_port()}"
-    changes = {
-        "server": {
-            "bind": endpoint,
-            "http": {"port": port},
-            "events_db": "events.sqlite",
-            "clips": {"folder": "clips", "post_s": 0.1},
-        },
-        "nodes.lab-pc.server": endpoint,
-    }
-    command = (sys.executable, "-m", "livessl", "serve", "--site", write_site(tmp_path, changes))
-    url = f"http://127.0.0.1:{port}"
+class ClipServer:
+    """A server's process with clips, which can be started again, and a node that plays recordings to it."""
 
-    def get(path: str) -> dict[str, Any]:
-        answer = httpx.get(f"{url}/api/v1/{path}", timeout=HANG_S)
+    def __init__(self, folder: Path, **changes: Any) -> None:
+        port, endpoint = free_port(), f"tcp://127.0.0.1:{free_port()}"
+        self._changes = changes | {
+            "server": {
+                "bind": endpoint,
+                "http": {"port": port},
+                "events_db": "events.sqlite",
+                "clips": {"folder": "clips", "post_s": 0.1},
+            },
+            "nodes.lab-pc.server": endpoint,
+        }
+        self._command = (sys.executable, "-m", "livessl", "serve", "--site", write_site(folder, self._changes))
+        self.url = f"http://127.0.0.1:{port}"
+
+    @contextmanager
+    def running(self) -> Iterator[subprocess.Popen[str]]:
+        """Run it until the end of the context."""
+        with started(*self._command) as process:
+            wait_until_ready(self.url, [process], CLOCK)  # type: ignore[list-item]
+            yield process
+
+    def get(self, path: str) -> dict[str, Any]:
+        answer = httpx.get(f"{self.url}/api/v1/{path}", timeout=HANG_S)
         assert answer.status_code == 200, answer.text
         found: dict[str, Any] = answer.json()
         return found
 
-    with started(*command) as process:
-        wait_until_ready(url, [process], CLOCK)  # type: ignore[list-item]
+    def play(self, make: Callable[[int], list[AssignedRecording]], run: str) -> None:
+        """Play recordings that begin one second from now."""
+        start_ns = (CLOCK.now_ns() // FRAME_NS + 20) * FRAME_NS
+        capture_recordings(site_of(self._changes), "lab-pc", make(start_ns), CLOCK, run, lambda: False)
+
+
+def test_clips_of_a_killed_server_are_there_after_its_restart(tmp_path: Path) -> None:
+    server = ClipServer(tmp_path)
+    get, url = server.get, server.url
+    with server.running() as process:
         for attempt in count(1):  # a busy machine can shed a clip
-            start_ns = (CLOCK.now_ns() // FRAME_NS + 20) * FRAME_NS
-            recordings = scene_recordings(start_ns)
-            capture_recordings(site_of(changes), "lab-pc", recordings, CLOCK, f"run-{attempt}", lambda: False)
+            server.play(scene_recordings, f"run-{attempt}")
             wait_until(lambda n=2 * attempt: made(get("clips")) >= n, "what becomes of both events")  # type: ignore[misc]
             if get("clips")["written"] >= 2:
                 break
@@ -79,8 +96,7 @@ def test_clips_of_a_killed_server_are_there_after_its_restart(tmp_path: Path) ->
     unfinished = tmp_path / "clips" / ".partial-small-1"
     unfinished.mkdir()
     (unfinished / "array-north.flac").write_bytes(b"half")
-    with started(*command) as process:
-        wait_until_ready(url, [process], CLOCK)  # type: ignore[list-item]
+    with server.running() as process:
         wait_until(lambda: get("clips")["clips"] == written, "the clips of before")
         wait_until(lambda: not unfinished.exists(), "the end of what was not finished")
         events = [event["id"] for event in get("events")["events"]]
@@ -125,34 +141,14 @@ def heard_by_one(start_ns: int) -> list[AssignedRecording]:
 
 
 def test_server_process_stores_no_speech_but_refused_events_and_says_why_after_a_restart(tmp_path: Path) -> None:
-    port, endpoint = free_port(), f"tcp://127.0.0.1:{free_port()}"
-    changes = {
-        "privacy": "no-speech",
-        "fusion.min_arrays": 2,
-        "server": {
-            "bind": endpoint,
-            "http": {"port": port},
-            "events_db": "events.sqlite",
-            "clips": {"folder": "clips", "post_s": 0.1},
-        },
-        "nodes.lab-pc.server": endpoint,
-    }
-    command = (sys.executable, "-m", "livessl", "serve", "--site", write_site(tmp_path, changes))
-    url = f"http://127.0.0.1:{port}"
-
-    def get(path: str) -> dict[str, Any]:
-        answer = httpx.get(f"{url}/api/v1/{path}", timeout=HANG_S)
-        assert answer.status_code == 200, answer.text
-        found: dict[str, Any] = answer.json()
-        return found
+    server = ClipServer(tmp_path, **{"privacy": "no-speech", "fusion.min_arrays": 2})
+    get, url = server.get, server.url
 
     def send(make: Callable[[int], list[AssignedRecording]], result: str) -> None:
         """Send recordings until one of their events has this result: a busy machine can shed clips."""
         for attempt in range(8):
             before = made(get("clips"))
-            start_ns = (CLOCK.now_ns() // FRAME_NS + 20) * FRAME_NS
-            run = f"run-{result}-{attempt}"
-            capture_recordings(site_of(changes), "lab-pc", make(start_ns), CLOCK, run, lambda: False)
+            server.play(make, f"run-{result}-{attempt}")
             wait_until(lambda: made(get("clips")) > before and not get("clips")["waiting"], "what becomes of them")  # noqa: B023
             if get("clips")[result]:
                 return
@@ -162,13 +158,10 @@ def test_server_process_stores_no_speech_but_refused_events_and_says_why_after_a
         ids = [event["id"] for event in get("events")["events"]]
         return [event_id for event_id in ids if get(f"events/{event_id}/clips")["missing"] == "speech"]
 
-    with started(*command) as process:
-        wait_until_ready(url, [process], CLOCK)  # type: ignore[list-item]
+    with server.running() as process:
         send(voiced, "with_speech")
         wait_until(lambda: ids_with_speech(), "the event with speech")
-        folders = recordings_in(
-            tmp_path / "clips"
-        )  # a busy machine can split the voice, and store a part without speech
+        folders = recordings_in(tmp_path / "clips")  # a busy machine can store a part of the voice without speech
         assert not [path for path in folders for event_id in ids_with_speech() if event_id in path.parts]
         send(heard_by_one, "written")
         metrics = httpx.get(f"{url}/metrics", timeout=HANG_S).text
@@ -178,8 +171,7 @@ def test_server_process_stores_no_speech_but_refused_events_and_says_why_after_a
         process.kill()
         process.wait()
         wait_until(lambda: not is_running(detector), "the end of the detector's process, whose server is gone")
-    with started(*command) as process:
-        wait_until_ready(url, [process], CLOCK)  # type: ignore[list-item]
+    with server.running() as process:
         wait_until(lambda: get("clips")["clips"], "the clips of before")
         events = {event["id"]: event for event in get("events")["events"]}
         clips = {event_id: get(f"events/{event_id}/clips") for event_id in events}

@@ -52,7 +52,7 @@ class LossCount:
         self._gaps = GapWatch(sample_rate_hz, block_s, SOUND_SERVER)
 
     def begin(self, *, hardware: bool) -> None:
-        """From the next block on, search for gaps by the rule for hardware, or by that for a sound server."""
+        """Search for gaps by the rule for hardware, or by that for a sound server, from the next block on."""
         self._gaps = GapWatch(self._sample_rate_hz, self._block_s, HARDWARE if hardware else SOUND_SERVER)
 
     def is_after_gap(self, block: Block) -> bool:

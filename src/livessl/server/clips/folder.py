@@ -208,8 +208,8 @@ class ClipFolder(ClipReader):
 
         There the clips of refused events go first, and the oldest first.
         Clips that are kept for ever stay, and unreadable ones of which that cannot be known. Those that the disk has
-        refused are read again first. Clips whose folders somebody has removed do not count any more. Return the number
-        of clips that were deleted.
+        refused are read again first. Clips whose folders were removed by other programs do not count any more. Return
+        the number of clips that were deleted.
 
         Raises
         ------
