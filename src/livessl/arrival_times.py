@@ -1,5 +1,7 @@
 """Finds when arrays that one clock samples received the same sounds, from their recordings.
 
+It is used by `calibrate`; the delays within one array are measured in `core/commission/observe.py`.
+
 With rough poses and places the microphones of each array are shifted to the time of emission and summed; what is left
 between the arrays is below the length of a window, and is measured like the delays within an array.
 """

@@ -1,4 +1,7 @@
-"""Verifies a site by sounds at measured places, and measures the poses of its arrays by such or by unknown sounds."""
+"""Calibrates from recordings: checks a site by claps at measured places, and measures the poses of its arrays.
+
+The numerics are in `core/commission/`; a running server does the same in `server/proposals.py`.
+"""
 
 from __future__ import annotations
 

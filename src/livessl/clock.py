@@ -1,4 +1,7 @@
-"""Clocks, and the text form of an instant. Only this module reads the machine's clock."""
+"""Clocks, the text form of an instant, and time zones. Only this module reads the machine's clock.
+
+It has the clock of the machine, those that pace a replay, and the UTC text of every time stamp.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Errors that commands report: each message is complete, for the person who ran the command."""
+"""Errors that commands report, each with a complete message, and "did you mean …?" for a misspelt name."""
 
 from __future__ import annotations
 

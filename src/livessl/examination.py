@@ -1,4 +1,8 @@
-"""Examines a site's set-up with recordings: what is wrong, on which channel of which array, and what cures it."""
+"""Runs `livessl doctor` on recordings: what is wrong with a set-up, on which channel of which array, and the cure.
+
+A running server does the same in `server/set_up_watch.py`; the words of the findings are in
+`core/commission/findings.py`.
+"""
 
 from __future__ import annotations
 

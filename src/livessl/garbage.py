@@ -1,4 +1,4 @@
-"""Thresholds of Python's garbage collector: high while a program loads, the usual ones once a server or node runs."""
+"""Sets when Python collects garbage: seldom while a program loads, as usual once a server or node runs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Formats log lines: as plain text, or as one JSON object per line for programs that collect logs."""
+"""Formats log lines as plain text or as one JSON object per line (`LIVESSL_LOG`), and logs uncaught errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""The whole pipeline in one process, without sockets, for the command line, notebooks, tests and calibration."""
+"""`livessl.locate` and `power_map`: the whole pipeline on recordings in one process, without sockets.
+
+It also checks samples and files that a caller passes: their shape, rate and type.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Notifies systemd (sd_notify) that this process is ready, alive, reloading or stopping.
+"""Notifies systemd (sd_notify) that this process is ready, alive (watchdog), reloading or stopping.
 
 A notification is a datagram to the socket that the environment variable NOTIFY_SOCKET names: see sd_notify(3). Other
 service managers with the same protocol work as well. If the variable is not set, nothing is sent.

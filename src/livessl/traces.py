@@ -1,4 +1,4 @@
-"""Traces of OpenTelemetry, which follow one sound from the microphones to an alert (extra `telemetry`).
+"""Traces of OpenTelemetry: spans that follow one sound from the microphones to an alert (extra `telemetry`).
 
 Processes need not pass anything on for that: the ids of a trace are a digest of what it is about, such as the id of an
 event. A span that another process or thread adds later finds its trace by itself. Without traces its SDK is not

@@ -1,4 +1,6 @@
-"""Messages as bytes: encoding, decoding, version, limits and validation. It knows no socket.
+"""The wire format between node and server: its bytes, its `VERSION`, its limits, and which messages are malformed.
+
+A message of another version does not pass `decode`; `server/ingest.py` handles what does not.
 
 A message is one ZeroMQ part: a fixed little-endian header (magic, version, kind, time of sending), then the body of its
 kind. Samples travel as float32, so that a frame arrives bit for bit as it was cut. Messages with a JSON body are in

@@ -1,4 +1,4 @@
-"""Encodes, decodes and checks the messages whose body is JSON: greetings, acknowledgements and requests.
+"""Messages whose body is JSON: greeting, acknowledgement, backfill request, good-bye; which of their fields are valid.
 
 `wire` adds the header, and encodes the messages that carry samples and levels.
 """

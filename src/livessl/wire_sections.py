@@ -1,4 +1,4 @@
-"""The sections at the end of a mark, as bytes: levels of its channels, and the state of its node's machine.
+"""The sections at the end of a mark: levels of the channels, drift, and clock and load of the node's machine, as bytes.
 
 A section is a tag, the length of its body in bytes, and the body. A figure that is not known is sent as NaN.
 """

@@ -1,4 +1,4 @@
-"""Computes many items on several cores: processes that are killed with the work, or with the process that began it."""
+"""Computes many items on several cores, in processes that are killed with the work or with their parent."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""The ZeroMQ socket of a capture node. It connects, and reconnects, by itself, and never blocks."""
+"""The ZeroMQ socket of a node: how soon it tries to reconnect, and how much it queues. It never blocks.
+
+`link` greets the server and notes that it is unreachable; `server/ingest.py` decides whether a node is accepted.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The protocol of audio devices, which a capture node uses whatever library drives the device."""
+"""The protocol of audio devices: blocks, the present problem, and lost blocks. `sound_device` implements it."""
 
 from __future__ import annotations
 

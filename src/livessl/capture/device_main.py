@@ -1,4 +1,4 @@
-"""The process that owns a node's audio device: `python -m livessl.capture.device_main WANTED FDS`.
+"""The process that owns a node's audio device: opens it, copies blocks into the ring, tries again if it is missing.
 
 Libraries of audio devices may loop endlessly, hang or flood the log when a device is unplugged. In a process of their
 own they can be killed. The process imports as little as possible: neither numpy nor other packages of livessl. It ends

@@ -1,4 +1,4 @@
-"""Starts and ends the process that owns a node's device, and reads its blocks, reports and output."""
+"""Starts, reads and kills the process that owns a node's device; `device_watch` decides when it has to be killed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Encodes as JSON the request to the process that owns a device, and the reports of that process.
+"""The request to the process that owns a device, and that process's reports on the device's state, as JSON.
 
 This module uses only the standard library, because the device process imports as little as possible.
 """

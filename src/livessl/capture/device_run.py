@@ -1,4 +1,4 @@
-"""Collects the observations of one run of the device process, by which `device_watch` judges the process."""
+"""Collects what one run of the device process did (beats, blocks, output); `device_watch` judges it."""
 
 from __future__ import annotations
 

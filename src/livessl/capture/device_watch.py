@@ -1,4 +1,8 @@
-"""Judges from the node's observations whether the process that owns a device still works. It reads no clock."""
+"""Decides that a device hangs, stalls or floods the log, and the words for it. It reads no clock.
+
+The time limits are here; `sound_device` restarts the device's process, and `portaudio` words why a device does not
+open.
+"""
 
 from __future__ import annotations
 

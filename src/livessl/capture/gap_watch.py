@@ -1,4 +1,7 @@
-"""Finds gaps that no driver flags, by comparing the count of samples with the time. It reads no clock."""
+"""Finds gaps in the sound that no driver flags (lost samples), by comparing the sample count with the time.
+
+Losses that the driver flags are counted in `loss_count`.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reads the kernel's list of capture devices: names, USB ports, serial numbers, and the programs that use them.
+"""Reads the kernel's list of capture devices (ALSA): names, USB ports, serial numbers, and which program uses one.
 
 PortAudio hides a device that another program uses. The kernel's list distinguishes it from a device that is not
 connected.

@@ -1,4 +1,4 @@
-"""Finds out whether this machine's clock is synchronized: from chrony or systemd-timesyncd, otherwise from the kernel.
+"""Finds out whether this machine's clock is synchronized and how large its error is: chrony, timesyncd or kernel.
 
 On Linux, the kernel always has a state of its clock. Programs for PTP set it as well, so it also covers clocks that are
 synchronized by PTP.

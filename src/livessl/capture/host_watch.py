@@ -1,4 +1,4 @@
-"""Watches the machine of a node: once a minute its clock and its load, in a thread of its own, which may wait."""
+"""Reads a node's clock state and load once a minute, in a thread of its own, which may wait."""
 
 from __future__ import annotations
 

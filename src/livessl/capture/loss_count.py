@@ -1,4 +1,7 @@
-"""Counts the sound of a device that is lost because the machine does not keep up. It knows no process."""
+"""Counts lost blocks of sound: overruns that the driver flags, and blocks that the node did not read in time.
+
+Gaps that no driver flags are found in `gap_watch`.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Messages of native libraries: each distinct one is logged once and counted, and their number is limited."""
+"""Logs what native libraries (ALSA, PortAudio) print: each distinct message once, counted and limited in number."""
 
 from __future__ import annotations
 

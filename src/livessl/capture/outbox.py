@@ -1,4 +1,6 @@
-"""A node's messages on their way to the server: which go next, and which the server may lack. It knows no socket.
+"""Decides the order in which a node sends (live sound, requested frames, backlog), and what awaits acknowledgement.
+
+How much a node keeps is limited in `spool`.
 
 A frame is in one of these places, and always in the spool until the server needs it no more:
 

@@ -1,4 +1,4 @@
-"""Makes the recordings that a node plays in place of an audio interface: files, or a simulated scene."""
+"""Makes the recordings that a node of device type `wav` or `scene` plays: files, or a simulated scene."""
 
 from __future__ import annotations
 

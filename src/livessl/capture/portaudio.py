@@ -1,4 +1,6 @@
-"""Lists the audio inputs of PortAudio, finds one by name, and opens it.
+"""Decides which audio input a device name, serial number or USB port means, opens it, and words why it does not open.
+
+A wrong sampling rate or number of channels is reported here; `input_search` runs the search in a process of its own.
 
 Only this module imports `sounddevice`. The import is inside functions, so that all other commands work on a machine
 without PortAudio. The library runs in a separate process (see `device_main`), without numpy.

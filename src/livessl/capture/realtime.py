@@ -1,4 +1,4 @@
-"""Real-time scheduling and locked memory for the process that owns a device, where the system permits them."""
+"""Requests real-time priority and locked memory for the process that owns a device, where the system permits it."""
 
 from __future__ import annotations
 

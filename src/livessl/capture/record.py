@@ -1,4 +1,4 @@
-"""Records an audio device to a session."""
+"""Records an audio device to a session, for `livessl record`; the files are written in `recordings/recorder.py`."""
 
 from __future__ import annotations
 

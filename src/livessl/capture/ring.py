@@ -1,4 +1,4 @@
-"""A ring of blocks in shared memory, from the process that owns the device (one writer) to the node (one reader).
+"""A ring of audio blocks in shared memory, from the device's process (writer) to the node (reader).
 
 It is read and written without numpy, because the writer's process loads as little as possible.
 

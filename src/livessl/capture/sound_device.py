@@ -1,4 +1,6 @@
-"""Delivers the blocks of an audio interface from a separate process, which it supervises, kills and restarts.
+"""Delivers the blocks of an audio interface from a process of its own, which it kills and restarts when it hangs.
+
+How long it waits before a restart is decided here; that a device hangs is decided in `device_watch`.
 
 PortAudio's thread may loop or print endlessly, or hang, when a device is unplugged, and nothing within the
 same process can stop it. The node therefore never loads the library (see `device_main`).

@@ -1,4 +1,6 @@
-"""Keeps the frames of a node until the server no longer needs them, in memory or in files that outlive the process.
+"""Keeps a node's frames, in memory or in files, until the server needs them no more; drops the oldest if it is full.
+
+The order of sending is decided in `outbox`.
 
 The limits of size and age are settings: `livessl.site.node_models.SpoolConfig` has the keys and their defaults. On
 disk, the spool is a folder of segments, which are only appended to. A segment is a magic number followed by records:

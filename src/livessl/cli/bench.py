@@ -1,4 +1,4 @@
-"""`livessl bench`: measure how fast this machine locates, or the load that a server on it carries."""
+"""`livessl bench`: measures how fast this machine locates, or which load a server on it carries."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Writes calibration files, and puts back the one before."""
+"""Writes calibration files for `calibrate --write`, puts back the one before (`--undo`), and notifies the server."""
 
 from __future__ import annotations
 

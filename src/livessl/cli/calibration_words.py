@@ -1,4 +1,4 @@
-"""Claps, poses and the speed of sound as `livessl calibrate` prints them: as lines, or as JSON objects.
+"""Words claps, poses and the speed of sound for `livessl calibrate`: as lines, or as JSON objects.
 
 The words of findings are in `livessl.core.commission.findings`.
 """

@@ -1,4 +1,4 @@
-"""`livessl capture`: a capture node, on its audio device or on files or a simulated scene in its place."""
+"""`livessl capture`: runs a capture node, on its audio device or on files or a simulated scene in its place."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`livessl check`: validate a site file, list all its faults and likely mistakes, and draw what it describes."""
+"""`livessl check`: validates a site file, lists all its faults and likely mistakes, and draws what it describes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`livessl demo`: a simulated scene played through real processes, with the error of every event."""
+"""`livessl demo`: plays a simulated scene through real processes, and prints the error of every event."""
 
 from __future__ import annotations
 

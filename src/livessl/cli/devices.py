@@ -1,4 +1,4 @@
-"""`livessl devices`: the audio inputs of this machine, by the names that a site file uses."""
+"""`livessl devices`: lists the audio inputs of this machine by the names that a site file uses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""`livessl doctor`: what is wrong with a set-up, on which channel, and what cures it."""
+"""`livessl doctor`: prints what is wrong with a set-up, on which channel, and the cure; asks the server or recordings.
+
+The faults are found in `examination.py` and `server/set_up_watch.py`, and worded in `core/commission/findings.py`.
+"""
 
 from __future__ import annotations
 

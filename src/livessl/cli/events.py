@@ -1,4 +1,4 @@
-"""livessl events: follow a running server's messages on the terminal."""
+"""`livessl events`: prints a running server's messages on the terminal, and connects again after a loss."""
 
 from __future__ import annotations
 

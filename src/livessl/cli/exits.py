@@ -1,4 +1,4 @@
-"""Exit codes of the commands, and their handling of Ctrl-C and SIGTERM."""
+"""Exit codes of the commands (0, 1, 2, 130), and what Ctrl-C, SIGTERM and SIGHUP do."""
 
 from __future__ import annotations
 

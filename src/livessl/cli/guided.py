@@ -1,4 +1,4 @@
-"""Calibration with a running server: it asks for a clap at each place, and prints how far off each was located."""
+"""Guided calibration with a running server: asks for a clap at each place, and says which claps were unclear."""
 
 from __future__ import annotations
 

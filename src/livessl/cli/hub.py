@@ -1,4 +1,4 @@
-"""`livessl hub`: run the hub of many sites, its API and its page."""
+"""`livessl hub`: runs the hub of many sites, its API and its page."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`livessl init`: write a first site file, from flags, from answers in a terminal, or from defaults."""
+"""`livessl init`: writes a first site file, from flags, from answers in a terminal, or from defaults."""
 
 from __future__ import annotations
 

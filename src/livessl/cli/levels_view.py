@@ -1,4 +1,4 @@
-"""The views of `livessl levels`: a table that is redrawn on a terminal, lines of text, or JSON."""
+"""Views of `livessl levels`: a table redrawn on a terminal, lines of text, or JSON."""
 
 from __future__ import annotations
 

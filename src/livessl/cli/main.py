@@ -1,4 +1,4 @@
-"""The command line: the list of commands, and `main`, which runs one and turns its errors into exit codes."""
+"""The list of commands, and `main`, which turns errors of files and disks into messages and exit codes."""
 
 from __future__ import annotations
 

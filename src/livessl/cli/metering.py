@@ -1,4 +1,4 @@
-"""Meters an audio device or a recording for `livessl levels`, and shows the levels while they come."""
+"""Meters an audio device or a recording for `livessl levels`, and waits for a device that is absent or busy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""The work of `livessl init`: from arguments, answers and connected interfaces to a new site file or a drawing."""
+"""The work of `livessl init`: asks for room, arrays and interfaces, or takes defaults, and writes the site file.
+
+The YAML text is made in `site/draft.py`.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The input of a capture node: its audio device, or files or a simulated scene in its place."""
+"""Chooses what a node captures: its audio device, or --wav files or a simulated scene in its place."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Options that several commands have in common, and functions that read their values."""
+"""Options that several commands share: --site, --method, --wav, --channels, --joint, --json and --write."""
 
 from __future__ import annotations
 

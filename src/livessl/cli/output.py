@@ -1,4 +1,4 @@
-"""Output that commands share: events on stdout, errors and notes on stderr."""
+"""Prints what commands share: an event as a line or as JSON, warnings of a site, errors and notes on stderr."""
 
 from __future__ import annotations
 

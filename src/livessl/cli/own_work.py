@@ -1,4 +1,4 @@
-"""Checks that a command writes over nothing but empty files and those that it has made itself."""
+"""Refuses to overwrite files that a command has not made itself (plans, pictures, reports)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The parser of command lines: each mistake is one line, with what was probably meant."""
+"""Words mistakes on the command line: an unknown option or value in one line, with "did you mean …?"."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Progress bars on stderr. They appear only on a terminal, and only once a command has run for `DELAY_S`."""
+"""Progress bars on stderr, only on a terminal and only once a command has run for `DELAY_S`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Questions in a terminal. Each has a default; a wrong answer is explained, and the question repeated."""
+"""Questions in a terminal, each with a default; a wrong answer is explained, and the question repeated."""
 
 from __future__ import annotations
 

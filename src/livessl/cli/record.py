@@ -1,4 +1,4 @@
-"""`livessl record`: record a session for replay, from a node's audio device or from files in its place."""
+"""`livessl record`: records a session for replay, from a node's audio device or from files in its place."""
 
 from __future__ import annotations
 

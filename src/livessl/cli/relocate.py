@@ -1,4 +1,4 @@
-"""`livessl relocate`: locates stored events again by another method or calibration, and prints old and new position.
+"""`livessl relocate`: locates stored events again by another method or calibration, and resumes if interrupted.
 
 The recordings are in a folder, or at a running server, which locates its own events.
 """

@@ -1,4 +1,4 @@
-"""The events of a running server, which locates them again from its recordings: `livessl relocate --url`."""
+"""`livessl relocate --url`: asks a running server to locate its events again, and waits while it is busy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`livessl replay`: plays a recorded session to a running server, or to a server in this process."""
+"""`livessl replay`: plays a recorded session, at some speed, to a running server or to one in this process."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`livessl serve`: run the fusion server, its API and its dashboard."""
+"""`livessl serve`: runs the fusion server with its API and its dashboard, until Ctrl-C or SIGTERM."""
 
 from __future__ import annotations
 

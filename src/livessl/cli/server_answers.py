@@ -1,4 +1,4 @@
-"""Answers of a running server to commands, and what is said when there is none."""
+"""Requests of commands to a running server (--url, --token-file), and what is said when none answers or it refuses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The sounds of a running server, one after the other, as commands that calibrate live need them."""
+"""Reads the last sounds of a running server, one after the other, for commands that calibrate live."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Returns the service manager of a command that runs until it is stopped."""
+"""Finds the service manager (systemd) of a command that runs until it is stopped."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`livessl simulate`: simulates a scene in the site's room, and writes the recordings of the arrays as a session."""
+"""`livessl simulate`: simulates a scene in the site's room, and writes the arrays' recordings as a session."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Standard streams of a command that was started without them, as some services and scripts do."""
+"""Opens standard streams that are closed at the start, as some services and scripts leave them."""
 
 from __future__ import annotations
 

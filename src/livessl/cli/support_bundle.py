@@ -1,4 +1,4 @@
-"""`livessl support-bundle`: one file that shows others the state of a server; it has no secrets and no sound."""
+"""`livessl support-bundle`: collects log, settings and state of a server into one file without secrets and sound."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reads the places and times of the sounds of a simulated session from its `truth.jsonl`."""
+"""Reads `truth.jsonl`, the true places and times of the sounds of a simulated session (--truth)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The address of a server, the token and certificates to reach it with, and single requests to it."""
+"""Server address, token and certificates of a client, single HTTP requests, and which errors may pass by themselves."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The asynchronous client."""
+"""The asynchronous client (`aconnect`): live messages with `async for`, and questions to the server."""
 
 from __future__ import annotations
 

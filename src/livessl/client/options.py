@@ -1,4 +1,4 @@
-"""Options of a subscription."""
+"""Options of a subscription: kinds, zone, confidence, track, rate, start, certificate, and when to give up."""
 
 from __future__ import annotations
 

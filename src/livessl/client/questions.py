@@ -1,4 +1,4 @@
-"""Single questions to a server, which both clients ask."""
+"""Single questions of both clients to a server: search for events, health."""
 
 from __future__ import annotations
 

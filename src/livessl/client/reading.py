@@ -1,4 +1,4 @@
-"""The bodies of a server's answers as models."""
+"""Turns a server's answers into models, and words the error about an answer of a newer server or another program."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Steps by which a client receives, catches up and resumes. Others carry them out: this module knows no socket.
+"""Decides what a client receives after a lost connection: catches up from the event log, without gaps or duplicates.
+
+The waits before a new connection are in `retry`. This module knows no socket.
 
 `conversation` is a generator of steps for one connection, and `Memory` is what outlives the connection. Events come
 over the WebSocket, and after every new connection also from the server's log of stored events; each is delivered once.

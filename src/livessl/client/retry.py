@@ -1,4 +1,4 @@
-"""Waits before a client connects again: they grow, and end if the user gave a limit."""
+"""Decides how long a client waits before it connects again (reconnects), and when it gives up."""
 
 from __future__ import annotations
 

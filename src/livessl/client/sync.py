@@ -1,4 +1,4 @@
-"""The synchronous client."""
+"""The synchronous client (`connect`): live messages by iteration, and questions to the server."""
 
 from __future__ import annotations
 

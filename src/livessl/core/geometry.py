@@ -1,4 +1,4 @@
-"""Array shapes, poses, directions, the search grid, and the speed of sound from a temperature.
+"""Shapes and poses of arrays, azimuth and elevation, the search grid, and the speed of sound from a temperature.
 
 Coordinates are in metres, right-handed, with z up and a corner of the room at the origin.
 """

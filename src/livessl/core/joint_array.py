@@ -1,4 +1,4 @@
-"""Joint arrays: several arrays that one clock samples, processed as one array of all their microphones."""
+"""Joint arrays: several arrays on one sample clock are processed as one array of all their microphones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Names of the localization methods. Checking a site file loads this module, and nothing that locates."""
+"""Names of the localization methods (`onset`, `srp-phat`, … or `MODULE:NAME`), and the error for an unknown one.
+
+Their code is registered in `core/locate/estimator.py`.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Places that look alike to arrays, known from the geometry of the microphones alone: mirror images.
+"""Mirror images (front-back ambiguity) by geometry alone: which places look alike to the arrays, and the warning.
 
 Microphones in one plane receive the same from a place and from its mirror image behind the plane; microphones on one
 line receive the same from every place on a circle around it. `core.locate.ambiguity` weighs these places by what was

@@ -1,4 +1,7 @@
-"""States of events, tracks and clocks, by name: without NumPy, so that a client of the API loads them quickly."""
+"""Names of states: `Status` of an event (located, direction_only, refused), of tracks and of clocks; without NumPy.
+
+Which status an event gets is decided in `core/stream/verdict.py`.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Delays between an array's microphones as functions of position, and the band that a grid can resolve."""
+"""Delays between an array's microphones for a position (TDOA), and from which frequency a grid has spatial aliasing."""
 
 from __future__ import annotations
 

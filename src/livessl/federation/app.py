@@ -1,4 +1,4 @@
-"""A hub as one process: its API and page, and its intake; run as many as wanted on one PostgreSQL database."""
+"""A hub as one process with its API, page and intake; several hubs may share one PostgreSQL database."""
 
 from __future__ import annotations
 

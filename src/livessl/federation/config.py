@@ -1,4 +1,4 @@
-"""The hub's own file: its models, and the reading of it, with all faults at once."""
+"""The hub's own file: its keys with their defaults, and the reading of it, with all faults at once."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Measures how long the next message of an outbox has been missing, counting only time in which it could be stored."""
+"""Measures how long a message of a site has been missing at the hub, before the hub gives it up."""
 
 from __future__ import annotations
 

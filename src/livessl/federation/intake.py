@@ -1,4 +1,4 @@
-"""Takes the sites' messages out of the stream and into the archive; of several hubs, one does it at a time.
+"""Takes the sites' messages out of NATS into the hub's archive; of several hubs one does it, and another takes over.
 
 The consumer is durable and shared: what one hub took and did not acknowledge, the stream gives to the next one.
 """

@@ -1,4 +1,4 @@
-"""The overview of a site from the archive, as the API describes it."""
+"""Decides when a site counts as away at the hub, and makes the overview of a site as the API describes it."""
 
 from __future__ import annotations
 

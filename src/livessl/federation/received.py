@@ -1,4 +1,4 @@
-"""The fields that a hub needs to store a message, and no more, so that sites of other releases are understood."""
+"""Checks what a hub reads in a site's message, and no more, so that sites of other releases are understood."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The contract of the hub's API: the site's models with the name of the site, and what only a hub has."""
+"""API models of the hub: sites with their conditions, and events, arrays, tracks and alerts with their sites."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The parts of each message that a hub stores, by its kind."""
+"""Writes the rows of each kind of message that a hub stores, and refuses a message that is not valid."""
 
 from __future__ import annotations
 

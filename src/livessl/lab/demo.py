@@ -1,4 +1,4 @@
-"""The demo: a simulated scene through real processes and real sockets, and the error of each result."""
+"""The demo: plays a simulated scene through server and nodes, and pairs each event with its true source."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A drawing of an array's frame to build it from: views to scale with channel numbers, and distances to measure."""
+"""Draws an array's frame to build it from (`livessl init --drawing`): views to scale, channels, distances."""
 
 from __future__ import annotations
 

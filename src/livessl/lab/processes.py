@@ -1,4 +1,4 @@
-"""Runs livessl commands as processes: starts them, waits until a server is ready, and stops them."""
+"""Runs livessl commands as processes for demo and benchmarks: starts them, waits for the server, stops them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Virtual audio interfaces: real PortAudio and ALSA record from them, and their faults are made by a control file.
+"""Virtual audio interfaces (ALSA, PortAudio) for tests and the demo; faults such as unplugging are made by a file.
 
 The C sources in the folder `interface` beside this file are compiled when they are first needed. A sample is 19 bits of
 the interface's own count of samples and 5 bits of its channel, so that the place of each sample is known.

@@ -1,4 +1,4 @@
-"""Assignment of recordings to a site's arrays: the channels that each array uses, and when its recording begins."""
+"""Assigns recordings to a site's arrays: which channels are an array's, and when its recording begins."""
 
 from __future__ import annotations
 

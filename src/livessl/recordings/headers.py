@@ -1,4 +1,4 @@
-"""Headers of WAV and FLAC files that disagree with the file's size, and their repair.
+"""Repairs headers of WAV and FLAC files that were never finished or are longer than the file.
 
 A program that is killed, or whose disk is full, leaves a header that was never finished. A copy that was interrupted
 leaves a file that is shorter than its header claims. In both cases the sound in the file can be read.

@@ -1,4 +1,4 @@
-"""The sound files of one command: each is opened and checked once, and none of its channels serves two arrays."""
+"""Opens the sound files of one command, each once, and refuses a channel that serves two arrays."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Recordings passed through pipelines, in the order in which devices would have delivered their blocks."""
+"""Plays recordings through pipelines in the order in which devices would deliver them, paced or as fast as possible."""
 
 from __future__ import annotations
 

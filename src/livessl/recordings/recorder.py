@@ -1,4 +1,4 @@
-"""Recording of sessions for replay: one file for each array and each gapless segment, with its start time."""
+"""Records sessions for replay: a file for each array and gapless segment; ends in order when the disk is full."""
 
 from __future__ import annotations
 

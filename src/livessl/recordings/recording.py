@@ -1,4 +1,4 @@
-"""Recordings that are read in blocks, as a device delivers them: files, samples in memory, and combinations."""
+"""Recordings that are read in blocks: sound files, samples in memory, loops, and several files as one."""
 
 from __future__ import annotations
 

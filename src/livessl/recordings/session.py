@@ -1,4 +1,4 @@
-"""Reads and writes a recorded session: its recordings with their start times, and its site file."""
+"""Reads and writes a recorded session (`session.yaml`): files with start times, and the copied site file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sound files on disk: read as far as they are complete, and written so that a sudden end loses less than a second.
+"""Opens, reads and writes WAV and FLAC files; reads damaged ones as far as they go, and survives a sudden end.
 
 Errors of libsndfile end here: they become a `DeviceError` or an `OSError` with a sentence for the user.
 """

@@ -1,4 +1,4 @@
-"""The contract of the API for alerts: a model of every value, answer and request. See `values.py`."""
+"""API models of alerts, rules and dead letters: their JSON fields and descriptions. See `values.py`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The contract of the API, continued: a model of every REST answer and of every error body. See `values.py`."""
+"""API models of every REST answer and error body (site, arrays, health, events, access). See `values.py`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The contract of the API, continued: models of what `clip.json` says about the recordings of an event."""
+"""API models of `clip.json`: recordings of an event, their format, and why an event has none."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The contract of the API, continued: what is wrong with the set-up, and what its sounds cannot show."""
+"""API models of findings of the set-up and of blind spots."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The contract of the API, continued: a model of every message of the live WebSocket. See `values.py`."""
+"""API models of every message of the live WebSocket (`hello`, `event`, `update`, `track`, `arrays`, `gap`, …)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The contract of the API, continued: models of an event that is located again."""
+"""API models of an event that is located again, with both answers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The contract of what nodes report of their channels and machines: parts of an array's state."""
+"""API models of nodes' reports: levels of channels, drift, clock and load of the machine."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The contract of the API: a model of every value in messages and answers.
+"""API models of the values in messages: the JSON fields of an event, a track and an array, with their descriptions.
 
 `messages.py` has the WebSocket messages and `answers.py` the REST answers that are made of them. The models describe
 and are never run on the hot path: `encode.py` writes the messages, the OpenAPI and AsyncAPI descriptions are generated

@@ -1,4 +1,4 @@
-"""The contract of the API for zones: a model of every value and answer. See `values.py`."""
+"""API models of zones, and of what tracks do in them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The fusion server as one process: `Server` starts the parts that `assembly` lists, and stops them in order."""
+"""The fusion server as one process: starts and stops the parts that `assembly` lists, and ends if a thread fails."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""States of the arrays: what the API and the log report of each, and which of them an operator has disabled.
+"""Reports the states of the arrays to API and log, and decides which arrays are disabled by an operator.
 
 `ArrayHealth.state` decides a state; this module passes on what the nodes and the operator report.
 """

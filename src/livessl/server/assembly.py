@@ -1,4 +1,4 @@
-"""The list of what runs in a server: `assemble` makes all parts and connects them; `app` starts and stops them.
+"""The list of everything that runs in a server: makes all parts and connects them; `app` starts and stops them.
 
 Each part is a property of `_Assembly`, which makes it when it is first needed. What a part needs is therefore made
 before it, and a part that another one needs only while the server runs is passed as a function.

@@ -1,4 +1,4 @@
-"""Loads the compiled kernels. At the first start on a machine, a process of its own compiles them meanwhile.
+"""Loads the compiled kernels; at the first start on a machine, compiles them in a process of its own meanwhile.
 
 python -m livessl.server.compiling      # compile now, for example while installing
 """

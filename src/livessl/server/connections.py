@@ -1,4 +1,7 @@
-"""HTTP connections: how many there may be, and how long one may take to send its request."""
+"""Limits HTTP connections: how many there may be, and how long a slow client may take (time-outs).
+
+Sizes of requests are limited in `http` and `api/auth.py`.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Hands messages on: all to the subscribers, and some to the hub, the journal and the alerts as well."""
+"""Decides which messages the hub, the journal and the alerts get besides the subscribers, and what of a replay."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The fusion thread: steps the fusion with what the nodes sent, and hands its results to the publisher."""
+"""The fusion thread: steps the fusion with what nodes sent, and begins and ends live runs and replays."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Events from their early to their final result: what was published, what replaces what, and what waits for the store.
+"""Decides which events are published and stored, and which early event a final one replaces.
+
+The order in which events were stored, for clients that resume, is in `history/log.py`.
 
 It works on values. The JSON of an event is made once, by `server.api.encode`, when the event is published and stored.
 It is read again only from the store, at the beginning of a live run.

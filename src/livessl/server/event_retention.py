@@ -1,4 +1,7 @@
-"""Deletes stored events that are older than `store.retention_days` of the site file."""
+"""Retention of events: deletes stored events that are older than `store.retention_days`.
+
+Alerts are deleted by `alerts/retention.py`, and clips by `clips/service.py`.
+"""
 
 from __future__ import annotations
 

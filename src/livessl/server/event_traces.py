@@ -1,4 +1,4 @@
-"""Spans of an event in the server: reception, fusion, estimate and publication, and what alerts make of it."""
+"""Spans of an event in the server (OpenTelemetry): reception, fusion, publication, alerts."""
 
 from __future__ import annotations
 

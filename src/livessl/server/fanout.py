@@ -1,4 +1,4 @@
-"""Fans numbered messages out to subscribers, each of which has a filter and a bounded queue."""
+"""Numbers messages and fans them out to subscribers, with filters; decides what a slow client misses (`gap`)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""The guard of the nodes' socket: CURVE, and a handler of ZeroMQ's authentication protocol ZAP (RFC 27) on a thread.
+"""Decides by its key whether a node may connect to the nodes' port (CURVE, ZAP), on a thread of its own.
+
+What a connected node is refused for is decided in `ingest`.
 
 pyzmq's `ThreadAuthenticator` does not serve here. Its callback gets the key but not the caller's address, which the
 list of refusals needs, and it does not report that its thread has failed. Handshakes that fail before a key is shown

@@ -1,4 +1,4 @@
-"""HTTP below the routes: the listening socket, TLS, and the limits that protect the server from its clients."""
+"""HTTP below the routes: listening socket, TLS certificate and ciphers, most connections, longest head."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""The server's side of the link to the nodes: greetings, sequence numbers, acknowledgements. It owns no socket."""
+"""Decides at a node's greeting whether it is refused, and words that; acknowledges frames, and counts lost ones.
+
+It is the protocol without a socket: `receiver` has the socket, `guard` checks keys, and `wire` decodes messages.
+"""
 
 from __future__ import annotations
 

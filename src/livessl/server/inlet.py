@@ -1,4 +1,4 @@
-"""The queue between the nodes' socket and the fusion. It is bounded in messages and bytes, and measures its delay."""
+"""The queue between the nodes' socket and the fusion, bounded in messages and bytes; measures its delay."""
 
 from __future__ import annotations
 

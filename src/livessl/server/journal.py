@@ -1,4 +1,6 @@
-"""Writes into the history what is no event: alerts, tracks, changes of arrays, and of the configuration.
+"""Decides which changes go into the journal: alerts, tracks that ended, changes of arrays and of the configuration.
+
+Its table is in `history/journal.py`, its route in `api/journal_routes.py`.
 
 No caller waits for the database: entries go through the backlog of the store, as events do.
 """

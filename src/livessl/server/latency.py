@@ -1,4 +1,4 @@
-"""Measures the latency from the sound to a client's socket, by stages, in histograms.
+"""Measures latency from the sound to a client's socket, by stages, in histograms.
 
 The latency begins at the earliest time at which a result can be known: the end of the window or, for an event, the end
 of the quiet that ends it. Time before that is not a delay of this system.

@@ -1,4 +1,4 @@
-"""Draws power maps on demand, on its own thread, so that maps never delay localization.
+"""Draws power maps on demand, on a thread of its own: the newest one, or one for each window to watchers.
 
 `newest` returns one map once; `watching` delivers the maps of every window. A window holds the evidence from which maps
 are drawn, not the maps, so it costs nothing until it is drawn.

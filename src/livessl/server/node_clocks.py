@@ -1,4 +1,7 @@
-"""Measures how far nodes' clocks are behind the server's, from when their messages were sent and received.
+"""Decides that a node's clock is behind the server's, from when its messages were sent and received, and words it.
+
+Clocks that are ahead of the server's are found in `core/stream/alignment.py`, and differences between nodes in
+`core/stream/clock_offsets.py`.
 
 A message that was sent by a clock that is behind seems to have taken that long. A real delay varies, so the least one
 of some seconds is taken; it is the clock's, or that of a network which never is faster. Frames from the future are

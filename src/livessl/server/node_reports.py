@@ -1,4 +1,4 @@
-"""The last report of each array's node: levels of its channels, and the state of its machine."""
+"""Keeps the last report of each array's node: levels of channels, state of its machine."""
 
 from __future__ import annotations
 

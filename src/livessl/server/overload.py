@@ -1,4 +1,4 @@
-"""Measures the load of the server, sheds work under overload, and reports both.
+"""Measures the load of the server, words an overload, and sheds work.
 
 The fusion thread measures its own delay in every turn, one pass of its loop, and `core.stream.load_policy` decides
 which work is shed. Every thread may read the figures.

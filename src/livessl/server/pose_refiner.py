@@ -1,4 +1,4 @@
-"""A thread that refines the poses of arrays by the sounds that the server locates anyway, for people to see."""
+"""Proposes better poses of arrays by itself, from the sounds that the server locates anyway."""
 
 from __future__ import annotations
 

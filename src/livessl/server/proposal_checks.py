@@ -1,4 +1,4 @@
-"""Reasons for which proposed poses cannot come into force, and whether they are good enough. Nothing here is kept."""
+"""Words why proposed poses cannot come into force, and decides when poses are good enough. It keeps nothing."""
 
 from __future__ import annotations
 

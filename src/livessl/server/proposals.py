@@ -1,4 +1,4 @@
-"""Proposals for the poses of arrays: measured by claps, refined by unknown sounds, or typed. None applies by itself.
+"""Makes and keeps proposals for poses: measured by claps, refined by sounds, or typed. None applies by itself.
 
 A person accepts a proposal (`Proposals.accept`); then it is written into the calibration file and comes into force.
 `pose_refiner` makes proposals on its own, and `proposal_checks` decides what keeps one from being accepted.

@@ -1,4 +1,4 @@
-"""Hands each result of the fusion to the part that publishes, keeps or draws it."""
+"""Hands each result of the fusion to those who publish, keep or draw it (events, tracks, updates, maps, clips)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Receives messages from nodes on a ZeroMQ socket, on its own thread.
+"""Receives messages of nodes on a ZeroMQ socket, on its own thread, and words why an address cannot be bound.
 
 `ingest` decides which messages are accepted and acknowledged.
 """

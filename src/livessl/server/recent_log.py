@@ -1,4 +1,4 @@
-"""Keeps the last log lines of a server in memory, for people who cannot reach its machine."""
+"""Keeps the last log lines of a server in memory, for `GET log` and support bundles."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Takes over a changed site file without a restart: zones, rules and actions, and where the microphones are.
+"""Reloads a changed site file without a restart: zones, rules and actions, and where the microphones are.
+
+Which keys need a restart is decided in `site/changes.py`.
 
 A file that cannot be used changes nothing. What a running server cannot take over stays as it was, and is named.
 """

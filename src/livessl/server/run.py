@@ -1,4 +1,4 @@
-"""One live run or one replay: everything that must not leak from one into the next."""
+"""The state of one live run or one replay; a live run continues where the one before a restart stopped."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The set-up that is in force in a running server: poses change by a calibration, and no restart is needed."""
+"""Holds the poses that are in force; brings others into force (accept, undo, reload) without a restart."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Examines the set-up with the sounds that are located, in a thread of its own: `livessl doctor`, all the time.
+"""Live doctor: examines the set-up with the sounds that are located, in a thread of its own, and publishes findings.
 
 It keeps the observations of the last sounds only, so that findings end once the set-up is mended. Findings have
 hysteresis (`livessl.core.commission.steady`): they do not come and go with single sounds.

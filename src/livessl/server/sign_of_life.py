@@ -1,4 +1,4 @@
-"""Reports to the service manager of a server that it serves, that its fusion goes on, and its condition in words."""
+"""Reports to systemd that the server lives, as long as its fusion thread takes turns, and its condition in words."""
 
 from __future__ import annotations
 

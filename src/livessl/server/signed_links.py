@@ -1,4 +1,4 @@
-"""Signed links: each opens one picture or recording without a token, until it expires.
+"""Signs and checks links that open one picture, recording or map without a token, until they expire.
 
 A link is the address with two parameters: `expires`, in seconds since the epoch, and `signature`, the HMAC-SHA256 of
 path and expiry. Nothing is stored of a link, so it ends by its expiry, with what it opens, or with the secret.

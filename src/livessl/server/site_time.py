@@ -1,4 +1,4 @@
-"""Keeps site time, which comes from the machine's clock in a live run, and from the recording in a replay."""
+"""Keeps site time: the machine's clock in a live run, the recording's in a replay; decides when a replay has ended."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A thread for work that no event waits for: it takes a small share of one core's time, and none under overload."""
+"""A thread for work that no event waits for: it takes a small share of one core, and none under overload."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The history of events, and what a restarted server must know: in memory, in an SQLite file, or in PostgreSQL."""
+"""Stores and finds events, and what a restarted server must know: in memory, an SQLite file, or PostgreSQL."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Keeps the latest published state of all tracks that have not ended."""
+"""Keeps the newest state of all live tracks; `core.stream.tracker` begins and ends tracks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Writes each track that has ended into the journal: its time, length, path, and zones."""
+"""Writes each track that has ended into the journal: its time, length, path and zones."""
 
 from __future__ import annotations
 

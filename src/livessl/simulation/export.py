@@ -1,4 +1,4 @@
-"""Writes a simulated scene as a session: a WAV file for each array, the truth, and the data for replay."""
+"""Writes a simulated scene as a session: WAV files, `truth.jsonl`, and the data for replay."""
 
 from __future__ import annotations
 

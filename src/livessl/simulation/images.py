@@ -1,4 +1,4 @@
-"""The sum over images as compiled code, several times faster than that of `room`, for campaigns. Needs numba."""
+"""The sum over image sources compiled by numba, several times faster than that of `room`, for campaigns."""
 
 from __future__ import annotations
 

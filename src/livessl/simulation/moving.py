@@ -1,4 +1,4 @@
-"""A source that moves through a room, as microphones record it: responses along its way, crossfaded."""
+"""A source that moves through a room (walking talker), as microphones record it."""
 
 from __future__ import annotations
 

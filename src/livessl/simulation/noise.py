@@ -1,4 +1,4 @@
-"""Noise that rooms have: pink, a fan, hum, music, bursts, and noise from everywhere or from one side.
+"""Makes the noise that rooms have: pink, a fan, hum, music, bursts, from everywhere or from one side.
 
 It knows no room and no level.
 """

@@ -1,4 +1,4 @@
-"""Scenes in a site's own room, and the recordings of its arrays."""
+"""Places random sounds in a site's own room, and renders the recordings of its arrays."""
 
 from __future__ import annotations
 

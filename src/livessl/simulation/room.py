@@ -1,4 +1,4 @@
-"""The image method: impulse responses of an empty box with equal walls, for all reverberation times in one pass."""
+"""The image method: room impulse responses (reverberation, RT60) of a box with equal walls."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Makes scenes, which are sounds at positions and times in a room, and renders the recordings of microphones there."""
+"""Makes scenes (sounds at positions and times in a room), and renders the recordings of microphones there."""
 
 from __future__ import annotations
 

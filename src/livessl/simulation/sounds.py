@@ -1,4 +1,4 @@
-"""Synthesised sounds for the demo, with the onsets and spectra of real ones, without room or position."""
+"""Synthesises the demo's sounds (door, keys, telephone, voice), without room or position."""
 
 from __future__ import annotations
 

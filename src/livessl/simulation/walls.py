@@ -1,4 +1,4 @@
-"""Impulse responses of a box whose walls differ in what they absorb, from a source that may face a direction.
+"""Impulse responses of a box whose walls differ in what they absorb, and of a source that faces a direction.
 
 It is the image method of `livessl.simulation.room` with a reflection factor for each wall and frequency band. Needs
 numba.

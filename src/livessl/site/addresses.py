@@ -1,4 +1,4 @@
-"""Network addresses of the site file: their syntax, IPv6, and whether other machines can reach them."""
+"""Checks network addresses of the site file: syntax, IPv6, origins, proxies, whether other machines can reach them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Checks of the site file's `alerts` against the rest of the file."""
+"""Checks `alerts` of the site file against the rest: unknown zones and actions, settings that lose alerts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Models of the site file's `alerts`: the rules, and the actions that deliver what the rules raise."""
+"""Keys and defaults of `alerts` in the site file: rules (hold-off, count, schedule) and actions (attempts, waits).
+
+Whether a rule alerts is decided in `server/alerts/rules.py`.
+"""
 
 from __future__ import annotations
 

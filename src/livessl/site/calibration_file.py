@@ -1,4 +1,4 @@
-"""Calibration files: where the file of a site is, and how it is read, written and put back.
+"""Calibration files: where a site's file lies, and how it is read, replaced as a whole, and put back.
 
 The command and the server both write them. A file is replaced as a whole, and the one before it is kept beside it, so
 that one step can be undone.

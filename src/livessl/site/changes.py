@@ -1,4 +1,4 @@
-"""Differences between two readings of a site file, by key, and those that a running server can take over."""
+"""Decides which changed keys of the site file a running server takes over, and which need a restart."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Checks of a whole site: arrays against room, grid and nodes, names, and what other machines can reach."""
+"""Checks of a whole site: arrays in the room, grid, nodes, names, privacy, and addresses without protection."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The text of a first site file, from room, arrays, interfaces and channels.
+"""Makes the text of a first site file, and proposes where its arrays stand.
 
 It asks nothing, and it neither reads nor writes files.
 """

@@ -1,4 +1,4 @@
-"""The nodes of a first site file: which array is captured by which interface, on which inputs."""
+"""Deals arrays to interfaces and inputs for a first site file."""
 
 from __future__ import annotations
 

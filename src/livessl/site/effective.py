@@ -1,4 +1,4 @@
-"""Lists the configuration in effect: every setting of a site, with its value and the source of the value."""
+"""Lists every setting in effect with the source of its value (`livessl config show`)."""
 
 from __future__ import annotations
 

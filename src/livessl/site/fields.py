@@ -1,4 +1,4 @@
-"""Base class and field types that the models of the site file share."""
+"""Base class and field types of the models of the site file (positions, intervals, file names)."""
 
 from __future__ import annotations
 

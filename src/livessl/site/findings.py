@@ -1,4 +1,4 @@
-"""Faults of YAML files: their places, their lines, and one sentence for each."""
+"""Words faults of YAML files with line and place, unknown keys with "did you mean …?", duplicate keys."""
 
 from __future__ import annotations
 

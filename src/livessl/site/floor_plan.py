@@ -1,4 +1,4 @@
-"""The picture of the floor plan: its kind, and its size in the room."""
+"""Reads the picture of the floor plan (PNG or SVG): its kind, its size, and the largest file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Guesses at what was meant: values in another unit, swapped axes, channels that are none, addresses that differ.
+"""Guesses what was meant by a wrong value: another unit, swapped axes, inputs that do not exist, addresses.
 
 Guesses come with the values to write instead. A value that is certainly wrong is a fault, and its guess is the cure; a
 value that is only unlikely is a warning.

@@ -1,4 +1,4 @@
-"""The place of the history: `server.events_db` names an SQLite file, or a PostgreSQL database by its URL."""
+"""Decides whether `server.events_db` is an SQLite file or a PostgreSQL URL."""
 
 from __future__ import annotations
 

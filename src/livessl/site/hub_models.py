@@ -1,4 +1,4 @@
-"""Models of the connection to NATS: `server.hub` of a site file, and `nats` of the hub's own file."""
+"""Keys and defaults of the connection to NATS: `server.hub` of a site file, and `nats` of the hub's own file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Audio interfaces whose inputs are known: how many there are, and which of them are microphones.
+"""Audio interfaces that are known: how many inputs they have, and which of them are microphones.
 
 It knows names and numbers only, and opens no device.
 """

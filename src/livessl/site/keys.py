@@ -1,4 +1,4 @@
-"""CURVE key pairs of the server and of its nodes, in a folder. It opens no socket."""
+"""Makes and reads CURVE key pairs of server and nodes, and enrols or dismisses nodes. It opens no socket."""
 
 from __future__ import annotations
 

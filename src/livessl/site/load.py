@@ -1,4 +1,4 @@
-"""Reading of a site file: all of its faults at once, each with its line. It opens no device and no socket."""
+"""Reads a site file: all of its faults at once, each with its line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Models of the site file, and `Site`: a site file with the arrays that were built from it.
+"""The keys of the site file and their defaults: room, grid, arrays, cameras, uncertainty, fusion and privacy.
+
+The other sections are in `node_models`, `server_models`, `alert_models`, `zone_models` and `hub_models`.
 
 The models only validate; `livessl.site.build` computes from them.
 """

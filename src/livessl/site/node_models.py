@@ -1,4 +1,4 @@
-"""Models of the site file's `nodes`: devices, spools, and the arrays on a node's channels."""
+"""Keys and defaults of `nodes` in the site file: devices, block length, spool limits, channels of arrays."""
 
 from __future__ import annotations
 

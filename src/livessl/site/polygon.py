@@ -1,4 +1,4 @@
-"""Simple polygons in the plane: what is wrong with one, and whether it holds a point. Values in, values out."""
+"""Polygons in the plane: whether one holds a point, and what is wrong with its corners."""
 
 from __future__ import annotations
 

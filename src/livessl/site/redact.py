@@ -1,4 +1,4 @@
-"""Takes secrets out of a site file and of texts, so that both can be given away for help."""
+"""Takes secrets out of a site file and of texts (support bundle)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files that hold secrets: they are written whole, and refused if other users can read them."""
+"""Writes and reads files with secrets, and refuses those that other users can read (permissions)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Models of the site file's `server` and `store`: the fusion server, its API, its sinks and its history."""
+"""Keys and defaults of `server` and `store` in the site file: ports, TLS, sinks, clips, history and retention.
+
+Those of `server.hub` are in `hub_models`.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Slips of the hand in YAML files, and what was meant: names without quotes, decimal commas, channels from 0."""
+"""Words slips in YAML: names without quotes, decimal commas, channels counted from 0."""
 
 from __future__ import annotations
 

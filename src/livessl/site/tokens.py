@@ -1,4 +1,4 @@
-"""Access tokens of clients: a file holds their names, roles and hashes, never the tokens."""
+"""The file of access tokens (names, roles, hashes): makes, finds and revokes tokens, and never stores one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Models of the site file's `zones` and `floor_plan`."""
+"""Keys and checks of `zones` and `floor_plan` in the site file: boxes, polygons, heights."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The file of the zones that operators draw: `zones_file` of the site file names it, and the server owns it."""
+"""Reads and writes the file of the zones that operators draw: `zones_file` of the site file names it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Describes a set-up that differs from the filed one, and defines how large a difference must be to be reported."""
+"""An alternative to the filed set-up, and how large a turn, shift or delay must be for doctor to report it."""
 
 from __future__ import annotations
 

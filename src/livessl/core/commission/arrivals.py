@@ -1,4 +1,4 @@
-"""Times at which arrays that share a clock received the same sounds. They determine distances, unlike directions."""
+"""Arrival times of the same sounds at arrays that share a clock; unlike directions, they determine distances."""
 
 from __future__ import annotations
 

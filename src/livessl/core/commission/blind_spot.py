@@ -1,4 +1,4 @@
-"""Describes a blind spot: a fault of a pose that the sounds so far could not reveal."""
+"""Words a blind spot, a fault of a pose that the sounds so far cannot reveal; `blind_spots` finds them."""
 
 from __future__ import annotations
 

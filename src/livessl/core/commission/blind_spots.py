@@ -1,4 +1,4 @@
-"""Says which faults of poses some sounds at unknown places could not have shown: shifts, turns, and a mirrored room.
+"""Finds blind spots: which shifts and turns of arrays, or a mirrored room, the sounds so far could not have shown.
 
 Two arrays whose lines of sight to a sound still meet after one of them was moved receive nothing that contradicts the
 site file: the place of the sound is unknown and explains it. How much of a fault remains visible follows from the

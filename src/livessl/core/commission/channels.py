@@ -1,4 +1,4 @@
-"""Finds faults of single channels in their samples, with or without sounds: clipping, a constant, hum, noise.
+"""Finds faults of single channels in their samples: clipping, a constant (DC), mains hum, noise above the others.
 
 `findings` finds dead, deaf, copied and inverted channels by the sounds that arrays received. Swapped channels are
 tried in `hypotheses`, compared in `judge` (in `trial` for sounds at known places), and chosen in `diagnosis`.

@@ -1,4 +1,4 @@
-"""Finds clocks that differ so much that one sound becomes two events, by comparing the rises in their recordings.
+"""Finds clocks so far apart that one sound becomes two events, from when recordings rise (a finding of doctor).
 
 Smaller differences are estimated and corrected while sounds are located (`livessl.core.stream.clock_offsets`).
 """

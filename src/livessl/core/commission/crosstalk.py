@@ -1,4 +1,4 @@
-"""Finds crosstalk: channels that receive each other's signal through the interface or the cable, without delay.
+"""Finds crosstalk: channels that receive each other's signal through interface or cable, without delay.
 
 Through the air, a sound reaches two microphones with a delay that depends on its place. Through the interface, the
 sound and the noise of the other channel arrive without delay. The phases between two channels, in all bins of the

@@ -1,4 +1,4 @@
-"""Chooses the alternative set-up that explains contradictions between delays, such as swapped channels or other poses.
+"""Chooses the alternative that explains contradictory delays best: swapped channels, a turned or moved array.
 
 If the filed set-up is wrong, the arrays' delays of a sound fit no place. These alternatives are compared: every order
 of an array's channels, rotations and shifts of an array, and another speed of sound. The alternative that explains the

@@ -1,4 +1,4 @@
-"""Finds the times at which the power of a recording rises, to compare recordings made by different clocks.
+"""Finds the times at which the power of a recording rises, by which recordings of different clocks are compared.
 
 The place of a microphone changes the level and the reverberation of a sound, but hardly the times at which its power
 rises above the power just before.

@@ -1,4 +1,7 @@
-"""Describes a fault of a set-up: its place, its words, and its cure."""
+"""A finding of doctor as a value (code, severity, place, words, cure), and the order of findings.
+
+The findings themselves are made and worded in `findings`.
+"""
 
 from __future__ import annotations
 

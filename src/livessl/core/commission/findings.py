@@ -1,4 +1,4 @@
-"""Makes findings from the observations of sounds: what is wrong, where, with which confidence, and the cure."""
+"""Makes and words most findings of doctor: dead, deaf, copied, inverted or swapped channels, levels and poses."""
 
 from __future__ import annotations
 

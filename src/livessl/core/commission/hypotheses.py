@@ -1,4 +1,4 @@
-"""Lists alternatives to the filed set-up, such as swapped channels, with places of the sounds at which fits begin.
+"""Lists the set-ups that doctor tries, such as swapped channels and turned, moved or exchanged arrays.
 
 Alternatives that are far from the filed set-up (another order of channels, exchanged arrays, a large rotation) are
 first ranked on a grid of places, which takes little time. Only the best of them are fitted.

@@ -1,4 +1,6 @@
-"""Compares alternatives to the filed set-up, such as swapped channels, by how well they explain the delays of sounds.
+"""Compares alternative set-ups, such as swapped channels, by how well they explain delays of sounds at unknown places.
+
+For sounds at known places this is done in `trial`; `diagnosis` chooses one of them.
 
 Every set-up has the same small freedom, and all of them are fitted together. There are many orders of channels and
 large rotations: `hypotheses` ranks them at the points of a grid, and only the best of them are fitted.

@@ -1,4 +1,6 @@
-"""Decides whether the whole room may be mirrored, because sounds at unknown places cannot exclude it.
+"""Decides whether the whole room may be mirrored, which sounds at unknown places cannot exclude.
+
+Mirror images of a single sound are in `core/mirror.py`.
 
 If all arrays and all sounds are reflected in a plane, the arrays receive the same signals. Assume that the centres of
 all arrays lie in the plane, and that the reflection of each array is nearly the array itself with its channels in

@@ -1,4 +1,4 @@
-"""Proposes places for claps that determine poses best, and predicts how well some claps determine them."""
+"""Proposes the place of the next clap of a calibration, and decides how well poses must be known (`AIM_M`)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Measures the delays of a sound between the microphones of an array, without using their positions.
+"""Measures the delays and polarity of a sound at the channels of one array, without using the site's geometry.
 
 The poses, the geometry and the order of the channels in the site file are not used, so that they can be examined with
 the result. The polarity of each microphone is measured with its delay: an inverted microphone turns the peaks of its

@@ -1,4 +1,4 @@
-"""Finds where sounds were from the delays within each array, and how far the delays contradict each other.
+"""Finds where sounds were from the delays within each array, and the misfit: how far the delays contradict each other.
 
 The contradiction, the misfit, is what remains of the delays at the best places. It is some 20 us in a set-up that is as
 filed, in a room, and 100 us and more where an array is turned or its channels are in another order.

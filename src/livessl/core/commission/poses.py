@@ -1,4 +1,4 @@
-"""Measures the poses of arrays from the delays of sounds by bundle adjustment.
+"""Measures the poses of arrays and the speed of sound, with standard deviations, by bundle adjustment.
 
 The unknowns are the rotation and the shift of each array that may move, the speed of sound if it may differ, and the
 places of the sounds. Known places and poses are priors, with their standard deviations. The arrays need no common

@@ -1,4 +1,4 @@
-"""Refines the poses of arrays and the speed of sound from sounds at unknown places, with at least one array known.
+"""Refines the poses of arrays and the speed of sound from sounds at unknown places.
 
 The places of the sounds and the poses are estimated together. The delays within the arrays are enough: the arrays need
 no common clock. If some arrays have one, the times between these arrays determine distances. Sounds at unknown

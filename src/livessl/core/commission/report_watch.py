@@ -1,4 +1,4 @@
-"""Finds faults in the reports of nodes about their channels and machines, with or without sounds. It reads no clock."""
+"""Finds faults in nodes' reports: clipping, hum, noise, lost blocks, an unsynchronized clock, an overloaded machine."""
 
 from __future__ import annotations
 

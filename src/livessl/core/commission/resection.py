@@ -1,4 +1,4 @@
-"""Measures the pose of an array from sounds at known places, even if the pose in the site file is far off."""
+"""Measures an array's pose from claps at known places, even if the filed pose is far off."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Stacks several set-ups with the delays of some sounds, so that all of them are fitted in one computation."""
+"""Stacks several set-ups, so that all are fitted in one computation; has the accuracy of a careful set-up."""
 
 from __future__ import annotations
 

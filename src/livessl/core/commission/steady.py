@@ -1,4 +1,4 @@
-"""Publishes findings with hysteresis, so that a finding does not appear and disappear with single sounds."""
+"""Decides when a finding appears and when it ends (hysteresis), so that it does not flicker with single sounds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Detects taps on microphones: sudden peaks of one input, far above its background and above all other inputs."""
+"""Detects taps on microphones (`levels --tap`): sudden peaks of one input, far above all other inputs."""
 
 from __future__ import annotations
 

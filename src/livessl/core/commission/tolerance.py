@@ -1,4 +1,4 @@
-"""Explains delays by a set-up that may be off by as little as people measure, and says how well that works.
+"""Fits delays by a set-up that may be off by as little as people measure, and says how well that explains them.
 
 Arrays are placed to within a centimetre or two and a degree at best. A set-up as filed that is compared with
 alternatives without that freedom always contradicts the sounds a little, and a small turn or shift of a wrong array

@@ -1,4 +1,7 @@
-"""Tries other set-ups than the one that is filed against the delays of sounds at measured places."""
+"""Tries alternative set-ups, such as swapped channels, against the delays of sounds at measured places (claps).
+
+For sounds at unknown places this is done in `judge`.
+"""
 
 from __future__ import annotations
 

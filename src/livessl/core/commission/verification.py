@@ -1,4 +1,4 @@
-"""Judges a set-up by sounds at known places."""
+"""Judges a set-up by claps at known places: whether findings or large errors show that it is wrong."""
 
 from __future__ import annotations
 

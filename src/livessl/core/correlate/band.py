@@ -1,4 +1,4 @@
-"""Frequency bands: the bins inside, the power in a band, dead channels, and which bands use the envelope.
+"""Frequency bands of arrays: bins inside, power in a band, dead channels of a sound, when the envelope is used.
 
 Checking a site file loads this module, so it imports nothing that locates.
 """

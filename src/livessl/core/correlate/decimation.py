@@ -1,4 +1,4 @@
-"""Lowers the sampling rate of an array's sound to what its band needs, frame after frame. It knows no geometry."""
+"""Lowers the sampling rate of an array's sound (anti-alias low-pass, decimation) to what its band needs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Generalized cross-correlation with phase transform (GCC-PHAT), band-limited, on a fine lag axis.
+"""GCC-PHAT of one array: cross-correlation with phase transform, band-limited, on a fine lag axis.
 
 The sign of a lag is defined here and nowhere else: *positive lag of pair (i, k): the sound reaches channel k later*.
 The paper's SRP equation has the opposite sign, which would mirror the map.

@@ -1,4 +1,7 @@
-"""The onset front end: a GCC of one array's frames in which each window and bin counts by how direct its sound is.
+"""The onset front end: a GCC whose windows and bins are weighed by how direct their sound is (onset weights).
+
+The background noise spectrum of located sounds is learned here; the noise floor of the detector is in
+`core/stream/activity.py`.
 
 Reverberation follows from the past. In each bin of the short-time spectrum the power P is compared with what the past
 explains, I = max(r N, max_s lambda^s P(t - s)): the stationary noise N, and all earlier power, decaying. The excess

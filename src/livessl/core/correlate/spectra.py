@@ -1,4 +1,4 @@
-"""Front ends, which compute the spectra of a segment that are then correlated. They know no geometry."""
+"""Front ends of the paper's methods: spectra of a segment, whole, averaged over frames, or cepstral prefiltering."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Beams of several arrays on one time axis: geometry first, then the lag that is left between their clocks."""
+"""Aligns the beams of several arrays in time: by geometry, then by the lag that remains between their clocks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The beam of one array at a place: one signal made of all microphones, by delay-and-sum or minimum variance.
+"""The beam of one array at a place (beamforming): delay-and-sum or minimum variance (MVDR), its weights.
 
 A sound S at the place reaches microphone k directly as d_k S, with d_k = (r/r_k) exp(-j 2 pi f (r_k - r)/c), r_k the
 distance to the microphone and r that to the array's centre. The beam is w^H X. Delay-and-sum takes w = d/(d^H d): all

@@ -1,4 +1,6 @@
-"""One signal of a sound at a known place: the beams of all arrays, aligned and combined by signal-to-noise ratio.
+"""Combines the beams of the arrays into one enhanced signal by signal-to-noise ratio, and chooses these arrays.
+
+`server/clips/record.py` sets its level and writes it.
 
 Every array's beam is brought to the time of emission by the travel time from the place to its centre. What is left
 between the arrays' clocks is measured by cross-correlating the beams. The aligned beams are then combined as the

@@ -1,4 +1,4 @@
-"""The short-time spectrum of signals and its inverse, with windows that add up to one."""
+"""The short-time Fourier transform of clips and its inverse, with windows that add up to one."""
 
 from __future__ import annotations
 

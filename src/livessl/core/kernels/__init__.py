@@ -1,4 +1,4 @@
-"""The kernels in use: compiled where numba is installed, otherwise on NumPy, with the same names and arguments."""
+"""Chooses the kernels in use: compiled where numba is installed, otherwise on NumPy, with the same names."""
 
 from __future__ import annotations
 

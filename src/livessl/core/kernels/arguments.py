@@ -1,4 +1,4 @@
-"""Groups of arguments that kernels take by name, and the constants that kernels share.
+"""Groups of arguments and constants that kernels share: lag blocks, search rows, cells and bounds.
 
 In all kernels L is the number of lags, P of an array's pairs, A of arrays, M of their microphones together, R of rows
 (all pairs of all arrays, array after array), C of cells. A grid's points are in its own order, z fastest. Of a cube

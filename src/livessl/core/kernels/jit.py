@@ -1,4 +1,4 @@
-"""Compiles functions by numba and keeps the machine code from one start to the next. Needs numba."""
+"""Compiles functions by numba and caches the machine code from one start to the next. Needs numba."""
 
 from __future__ import annotations
 

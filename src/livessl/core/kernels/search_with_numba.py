@@ -1,4 +1,4 @@
-"""Kernels of the peak search that numba compiles: branch and bound over the cells of the grid.
+"""The peak search compiled by numba: branch and bound over the cells of the grid.
 
 `search_with_numpy` has a function of the same name and arguments for each kernel, with the documentation. Both
 implementations find the same points and powers, bit for bit. Kernels that call each other stand in one file, because

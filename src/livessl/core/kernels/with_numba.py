@@ -1,4 +1,4 @@
-"""Kernels that numba compiles. `with_numpy` has a function of the same name and arguments for each, and documents it.
+"""Kernels that numba compiles: decimation, PHAT, onset weights, maps, power off the grid. `with_numpy` documents them.
 
 Kernels of maps and of the search give the same bits as those functions; the other kernels differ only by rounding.
 """

@@ -1,4 +1,4 @@
-"""The kernels on NumPy alone: they work everywhere, and the compiled ones are tested against them.
+"""The kernels on NumPy alone, the reference for numba's: decimation, PHAT, onset weights, maps, power off the grid.
 
 The kernels of the search are in `search_with_numpy`. Names of dimensions are those of `arguments`.
 """

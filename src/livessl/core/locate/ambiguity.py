@@ -1,4 +1,4 @@
-"""Compares a position with its mirror images by their power. It uses correlations, and no samples.
+"""Decides whether a position is ambiguous with its mirror images, and how probable each of the candidates is.
 
 `livessl.core.mirror` proposes the mirror images from the geometry of the microphones. If another array, or a microphone
 off the plane, distinguishes them from the position, they have less power.

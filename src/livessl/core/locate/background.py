@@ -1,4 +1,4 @@
-"""Estimates the background of a sound from the frames before it. It uses the power of frames, and their correlations.
+"""Estimates the steady background of a sound, such as a fan, from the frames before it.
 
 The pre-roll shows the part of the evidence that comes from the background. If the background is not far below the
 sound, frames that are much weaker than the loudest one are mostly background, but their onsets count as much as others.

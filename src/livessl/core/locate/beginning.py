@@ -1,4 +1,4 @@
-"""Finds the frames in which a sound begins. It uses only the power and time of frames.
+"""Finds the frames in which a sound begins, which show its source before music or a later noise mixes in.
 
 Music, or a noise that starts after the sound, can have onsets just as clear, and the pre-roll does not reveal it. The
 first frames do: if a place emitted nothing when the sound began, another source is there.

@@ -1,4 +1,4 @@
-"""Judges a position: its covariance, the probability that it is right, and whether to report it at all.
+"""Computes the confidence of a position, scales its covariance, and decides below which confidence it is refused.
 
 It sees correlations and no sound. The constants were fitted to simulated events by
 `livessl evaluate localizer --half development`.

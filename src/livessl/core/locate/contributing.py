@@ -1,4 +1,4 @@
-"""Decides which arrays contribute to a position, and which show only noise. It uses correlations, and no samples.
+"""Decides which arrays contribute to a position, and which show only noise (false-alarm threshold of an array).
 
 If the phases between the microphones are random, each pair's GCC is noise of a known standard deviation, and an array's
 SRP is a smooth random field over the directions. The probability that the highest point of such a field exceeds u

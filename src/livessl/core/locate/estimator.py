@@ -1,4 +1,4 @@
-"""The interface of estimators, and the registry of localization methods.
+"""The interface of localization methods (estimators), and their registry: `register`, or `MODULE:NAME`.
 
 `Estimator` is the protocol, and `register` adds a method. `livessl.core.locate.map_estimator.MapEstimator` is a base
 class whose subclasses have to implement only `locate`.

@@ -1,4 +1,4 @@
-"""Correlates an array's sound frame by frame, and removes one source from the correlations.
+"""Correlates a sound frame by frame, and removes one source from the correlations to reveal a second one.
 
 All pairs of an array receive a source with the same spectrum, so the share of the source in their GCCs is the same even
 function of lag, shifted to the delay of each pair. The mean over the pairs around their delays gives this share for

@@ -1,4 +1,4 @@
-"""A base class for estimators that map each array's GCC-PHAT onto one grid and sum the maps."""
+"""The base class of estimators that sum power maps, and the resolution of the maps that are drawn."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Makes the evidence of a sound from its onsets: the GCCs of each array, and the lags of its background."""
+"""Makes the evidence of the method `onset`: each array's onset GCCs, and the lags of its background."""
 
 from __future__ import annotations
 

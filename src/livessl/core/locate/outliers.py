@@ -1,4 +1,6 @@
-"""Finds the position that most arrays agree on, and the outliers. It uses correlations, and no samples.
+"""Finds the position that most arrays agree on (consensus), and excludes arrays that disagree as outliers.
+
+It words "arrays disagree"; `core/stream/outlier_votes.py` decides from past events which arrays are suspect.
 
 The map of each array has its own highest place. At the common position, an array that agrees loses almost nothing of
 its peak-to-RMS ratio. An array that is turned or moved, or records something else, loses nearly all of its ratio there,

@@ -1,4 +1,4 @@
-"""Decides whether a sound came from outside the search volume. It uses correlations, and no samples.
+"""Decides whether a sound came from outside the search volume, and words that reason. It uses correlations only.
 
 The search ends at the surface of the volume. A sound from beyond the surface is therefore located on the surface, or at
 a place inside at which all arrays have some power. Both places have less power than the true one, which is searched for

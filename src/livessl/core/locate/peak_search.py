@@ -1,4 +1,6 @@
-"""Finds the highest points of the summed power maps exactly, without the maps, by branch and bound over grid cells.
+"""Finds the highest grid points of the summed power maps exactly, by branch and bound, without computing the maps.
+
+`refine` finds the maximum between grid points; `srp` has the map's definition.
 
 Over a cell of the grid each pair's delay lies in an interval. The maximum of its GCC over that interval is an upper
 bound of the pair's value at any point of the cell. The sum of these maxima is an upper bound for the cell, and a cell

@@ -1,4 +1,4 @@
-"""The highest place of some arrays' summed maps. It sees correlations and no sound."""
+"""Finds the highest place of some arrays' summed maps: a search on the grid, then a refinement below it."""
 
 from __future__ import annotations
 

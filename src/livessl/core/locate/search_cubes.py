@@ -1,4 +1,4 @@
-"""Divides a grid into the cubes of a peak search: all points in a room, but fewer points far from all arrays in a yard.
+"""Divides the grid for the peak search: every point in a room, fewer points far from all arrays in a large volume.
 
 Far from an array its delays change little from one grid point to the next. In a volume with more points than can be
 examined, a cube far from all arrays holds only every second, fourth, … point along each axis. The number of points

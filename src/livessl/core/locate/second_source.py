@@ -1,4 +1,4 @@
-"""Finds a second source that sounds at the same time, after the part of the first source is removed from the evidence.
+"""Decides whether a second source sounds at the same time and where, after the first one's part is removed.
 
 The remainder (`livessl.core.locate.frame_gccs`) comes from a second source, from reverberation of the first source, or
 from noise that was there before. A second source is the highest place of the remainder, and stands out from

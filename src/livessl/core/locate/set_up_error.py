@@ -1,4 +1,4 @@
-"""The part of a position's error that comes from the set-up: arrays that stand or point elsewhere than the site says.
+"""Computes the part of a position's covariance that comes from the set-up: arrays not exactly where the site says.
 
 The position is where the delays fit best: a displacement d_m of microphone m moves it by
 dp = (sum g g^T / s^2)^-1 sum_m G_m d_m, g the slopes of the path differences with the position, and G_m the pull of

@@ -1,4 +1,4 @@
-"""Steered response power (SRP-PHAT): maps an array's GCC onto the grid, and computes it as a function of position.
+"""SRP-PHAT: maps a GCC onto the grid, with the weight 2/K by which an array of K microphones counts in the sum.
 
 SRP(r) = 2/K sum_{i<k} R_ik(tau_ik(r)) with tau_ik(r) = (|r - r_k| - |r - r_i|) / c and the lag's sign of `gcc_phat`.
 Of the delays of K(K-1)/2 pairs only K-1 are independent. The factor 2/K gives every array the weight of its independent

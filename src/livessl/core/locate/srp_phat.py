@@ -1,4 +1,4 @@
-"""The paper's standard method, SRP-PHAT, and two variants with another front end."""
+"""The paper's methods: `srp-phat`, and the variants `cepstral` and `averaged` with another front end."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Widens the evidence of arrays whose channels have different clocks. It uses correlations, and no samples.
+"""Widens the correlations of an array whose channels come from several recorders, and thus have different clocks.
 
 If the channels of an array come from several recorders, their clocks may differ, by a standard deviation of
 `Uncertainty.clock_s` between two channels. The delays of the pairs then have no common place, and the sum of sharp

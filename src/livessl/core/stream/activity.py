@@ -1,4 +1,4 @@
-"""Activity detection on 50 ms frames: the paper's rule, exact over a finished event and causal for live use.
+"""Activity detection: from which level on a frame is active, the noise floor, hang-over and pre-roll of a sound.
 
 The rule (Garcia-Barrios et al., section on the sound activity detector): a frame is active if its mean power is at
 least a tenth of the reference power. Over a finished event the reference is the event's maximum. Live it is a decaying

@@ -1,4 +1,6 @@
-"""Aligns the frames of all arrays on one frame index, and decides which are late for early results. It reads no clock.
+"""Aligns the frames of all arrays on one frame index; decides how long an array is awaited, and which frames are late.
+
+This holds for early results; final results use `final_input`. A frame ahead of the server's clock is refused here.
 
 A frame index closes when every array that is awaited has reached it, or at its deadline. An active frame that comes
 later is kept and counted as late. Early results that were already computed do not include it; the final pass

@@ -1,4 +1,4 @@
-"""Decides the health of an array: healthy, quiet, degraded, lost and so on, with the reason. It reads no clock.
+"""Decides the health of an array (healthy, quiet, degraded, lost, disabled), its reason, and dead or weak channels.
 
 `ArrayHealth.state` is the only function that decides the state. The module also keeps the figures of each array.
 """

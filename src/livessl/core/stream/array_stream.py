@@ -1,4 +1,4 @@
-"""Keeps one array's frames on the joint frame index, their correlations, and the progress of the array."""
+"""Keeps one array's frames on the joint frame index, their correlations, and whether the array is awaited."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Backfill: requests frames of an event from arrays that did not detect it, and decides whether to use them.
+"""Chooses which arrays must send missing frames of an event that they did not detect, and whether to use these.
 
 If the result of the arrays that detected the sound is unsure, frames are requested from the others. They are used only
 if they improve the result. Evidence is not normalised, so an array that received none of the sound hardly changes the

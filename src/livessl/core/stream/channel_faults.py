@@ -1,4 +1,4 @@
-"""Finds channels that are copies of others, and inverted channels, in the sound.
+"""Finds copied and inverted channels in live sound, and words why an array with them is not used.
 
 An array with such a fault gives wrong directions with high confidence, so its sound is not used. This module uses
 samples and correlations, and locates nothing. `array_health` finds dead and weak channels, and

@@ -1,4 +1,6 @@
-"""Estimates the offsets of the nodes' clocks from located events. It reads no clock.
+"""Estimates the offsets of the nodes' clocks from each other by located events. It reads no clock.
+
+Clocks are compared with the server's in `server/node_clocks.py`; the drift of a device is measured in `timeline`.
 
 A sound at a known position arrives at each array after its travel time; any other difference of its arrival times is a
 difference of the clocks. Arrival times are compared by the rises of the power, correlated between arrays, so that

@@ -1,4 +1,4 @@
-"""Locates events that have ended or were cut short, and decides whether frames are requested for them first."""
+"""Decides when an event is reported: at once, or after frames that were requested for it have come."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Collects the excerpts from which events and windows are located.
+"""Collects the excerpts of sound from which events and windows are located.
 
 It also decides which samples are kept while a sound continues. It correlates frames before a sound begins, so that
 locating the sound does not have to wait for the correlation of the pre-roll.

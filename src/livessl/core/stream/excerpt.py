@@ -1,4 +1,4 @@
-"""The sound from which an event or a window is located, in the form that estimators use. It decides nothing."""
+"""The sound of all arrays from which an event or window is located, as estimators take it. It decides nothing."""
 
 from __future__ import annotations
 

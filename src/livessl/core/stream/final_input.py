@@ -1,4 +1,6 @@
-"""Collects the frames of all arrays, late ones included, for the final pass, and finds up to where they are complete.
+"""Collects frames for the final pass, late ones included; drops and counts those that are `too_late` for it.
+
+How long missing frames are awaited is decided in `held_frames`.
 
 A frame that was late for early results is still part of the final result. A frame that comes after the results of its
 time are final is dropped and counted as `too_late`. Frame indices of single arrays follow the clocks of those arrays.

@@ -1,4 +1,4 @@
-"""Makes early and final results, by two passes over the same messages. It reads no clock.
+"""Makes early and final results by two passes over the same frames, and decides from when on a result is final.
 
 The early pass closes a frame index at its deadline, even if frames are missing. The final pass closes a frame index
 when every array has sent all its frames, in whatever order and however late; its events replace the early ones. If no

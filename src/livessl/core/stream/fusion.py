@@ -1,4 +1,4 @@
-"""Makes updates, events and tracks from the frames of all arrays. It reads no clock.
+"""Makes updates, events and tracks from the frames of all arrays: the order of the stages. It reads no clock.
 
 `Fusion.step(messages, now_ns)` is the only entry for messages, live and replayed. It uses these stages: `Alignment`
 assigns the frames to joint frame indices and closes them, `EvidenceCollector` correlates frames and collects excerpts,

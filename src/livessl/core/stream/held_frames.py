@@ -1,4 +1,4 @@
-"""Frames that wait for the final pass: in order of the joint frame index, for a limited time and in limited memory.
+"""Decides how long and in how much memory frames wait for an array that is away, before results become final.
 
 When memory gets short, the samples of the less clear arrays of each sound go first: the sound is still found, at its
 time and with all arrays that detected it, and located from the clearest ones. Only when that is not enough are missing

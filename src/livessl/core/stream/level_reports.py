@@ -1,4 +1,4 @@
-"""Makes reports of channel levels, one for each second of sound, which marks carry."""
+"""Makes a node's reports of channel levels, one for each second, which marks carry to the server."""
 
 from __future__ import annotations
 

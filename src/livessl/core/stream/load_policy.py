@@ -1,4 +1,4 @@
-"""Decides which work is shed while sound arrives faster than it can be located.
+"""Decides under overload which work is shed and when, by the delay of the sound, and which arrays are still used.
 
 `LEVELS` lists the work that is shed at each level, the least important first. `LoadPolicy` chooses the level by the
 delay of the sound, with hysteresis, and reads no clock. `Clearest` chooses the arrays that are used when arrays are

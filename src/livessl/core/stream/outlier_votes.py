@@ -1,4 +1,4 @@
-"""Counts which arrays were outliers in the last events, and decides which arrays are suspect."""
+"""Decides which arrays are suspect: those that were outliers in many of the last events."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Parameters of the fusion, with their defaults. The models of the site file import them, so it loads no estimator."""
+"""Defaults of the fusion: window, update interval, longest event, waits for late arrays and for backfill."""
 
 from __future__ import annotations
 

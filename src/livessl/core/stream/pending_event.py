@@ -1,4 +1,6 @@
-"""Keeps the state of an event from its first active frame until it is reported. It locates nothing.
+"""Decides when an event begins and ends, and keeps its state until it is reported. It locates nothing.
+
+Its id, status and reason are made in `verdict`.
 
 Its states are these.
 

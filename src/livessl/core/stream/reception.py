@@ -1,4 +1,4 @@
-"""Records which frames of one array have arrived for the final pass (`final_input`), live and as backlog.
+"""Records which frames of one array have arrived for the final pass, live and as backlog.
 
 Frame indices are those of the array's own clock. A node that reconnects sends its backlog between live frames. Until
 the backlog is complete, frames are complete only up to the last backlog frame, even if later live frames have arrived.

@@ -1,4 +1,8 @@
-"""One array's frames become messages: frames around sound, marks in between. It knows no device and no socket."""
+"""Decides which frames a node sends (those around a sound) and when a mark stands for silence.
+
+It also decides what digital silence is, and remembers the last seconds for backfill requests. `activity` decides from
+which level on a frame is active.
+"""
 
 from __future__ import annotations
 

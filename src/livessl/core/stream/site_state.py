@@ -1,4 +1,4 @@
-"""The state that all passes over one site's messages share."""
+"""The state that the early and the final pass share: poses in force, disabled arrays, and the work that is shed."""
 
 from __future__ import annotations
 

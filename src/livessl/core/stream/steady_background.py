@@ -1,4 +1,4 @@
-"""Measures the in-band power of frames without steady noise such as hum and rumble. It reads no clock.
+"""Removes steady hum, tones and rumble from a frame's power before its activity is judged. It reads no clock.
 
 Mains hum, the tone of a fan or rumble can be far above everything else in the band. A sound that is 30 dB above the
 rest of the background then hardly raises the level. The background is therefore tracked in every bin of the frames'

@@ -1,4 +1,4 @@
-"""Converts sample indices to site time, and cuts blocks into frames. It reads no clock."""
+"""Converts sample indices to site time in spite of jitter and drift, and cuts blocks into frames. It reads no clock."""
 
 from __future__ import annotations
 

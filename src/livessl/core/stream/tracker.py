@@ -1,4 +1,4 @@
-"""Tracks sources, with a constant-velocity Kalman filter for each source. Time is an argument.
+"""Starts, joins, confirms and ends tracks: a Kalman filter for each source, with gates. Time is an argument.
 
 The estimates of one time are assigned to the tracks for which all assignments together are most likely, so that two
 sources that cross keep their tracks by their velocities. A source that turned round in a pause is also searched for at

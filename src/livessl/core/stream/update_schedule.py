@@ -1,4 +1,4 @@
-"""Decides which windows of a continuing sound are located: one every `update_frames`, or fewer under overload."""
+"""Decides how often updates of a continuing sound are located: one every `update_frames`, or fewer under overload."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Values that a node reports about itself: the levels of its channels, and the state of its machine."""
+"""A node's report on itself as values: levels of its channels, and clock and load of its machine."""
 
 from __future__ import annotations
 

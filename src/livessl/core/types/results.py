@@ -1,4 +1,7 @@
-"""Values that fusion returns: estimates, updates, events, tracks, windows and backfill requests."""
+"""Results of the fusion as values: estimates, updates, events, tracks, candidates and backfill requests.
+
+How they are judged is in `core/stream/verdict.py`; their JSON is made in `server/api/encode.py`.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Values from a device to the evidence of a sound: blocks, frames, marks, arrays and their correlations."""
+"""Sound as values: blocks, frames, marks, GCCs and arrays; their limits, and the length of a frame."""
 
 from __future__ import annotations
 

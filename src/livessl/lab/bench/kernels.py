@@ -1,4 +1,4 @@
-"""The speed of this machine at correlation, search and maps, relative to its rate of bare table look-ups.
+"""Times correlation, search and maps on this machine (`livessl bench`), relative to bare table look-ups.
 
 Two or more arrays of four microphones stand in the paper's room of 8 x 10 x 4 m with a reverberation time of 0.7 s; a
 block has 4096 samples. Every round times each case twice: in turn, when the other cases have filled the caches, and

@@ -1,4 +1,4 @@
-"""A server under the load of many arrays and clients: its losses, its latency and its resources."""
+"""`livessl bench --live`: a server under many arrays and clients; its losses, latency, processor time and memory."""
 
 from __future__ import annotations
 

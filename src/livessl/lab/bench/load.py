@@ -1,4 +1,4 @@
-"""The load: one process sends the sound of many arrays over the real wire."""
+"""The load of `bench --live`: one process sends the sound of many arrays over the real wire."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Runs a campaign: distributes positions, keeps every finished one and resumes. It does not know what a position is."""
+"""Runs a campaign of experiments on cores or on Dask, keeps every finished position, and resumes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The claims of the paper's text, and the numbers that decide them. They are fixed; nothing is fitted to a result."""
+"""The claims of the paper's text, and the numbers that decide whether they are reproduced. Nothing is fitted."""
 
 from __future__ import annotations
 

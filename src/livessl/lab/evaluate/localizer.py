@@ -1,4 +1,4 @@
-"""The localizer's own campaign: `onset` against the paper's standard, on the same signals, scenario by scenario.
+"""The localizer's own campaign: `onset` against the paper's standard in many scenarios; fit of the confidence.
 
 The clips of each class are divided in the order of their names: the first, third, … are for development, the others for
 tests. Positions depend on the seed. All cases of a position share its responses and recordings. The module draws no

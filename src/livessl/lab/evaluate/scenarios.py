@@ -1,4 +1,4 @@
-"""The localizer's scenarios: which arrays take part, and which faults they or their descriptions have.
+"""Scenarios of the localizer's campaign: which arrays take part, and which faults they have.
 
 They are plain values. Everything is in the paper's room. A case is simulated with the true arrays and localized with
 the believed ones, as a faulty site file describes them.

@@ -1,4 +1,4 @@
-"""Measures of localization and tracking of several sources: OSPA, and the measures of the LOCATA challenge.
+"""Measures of localization and tracking of several sources: OSPA, and those of the LOCATA challenge.
 
 OSPA: Schuhmacher, Vo and Vo, IEEE Trans. Signal Process. 56(8), 2008. LOCATA: Evers et al., IEEE/ACM Trans. Audio
 Speech Lang. Process. 28, 2020; the challenge measures directions, this module positions.

@@ -1,4 +1,4 @@
-"""Distances and expected errors of a site. It draws and prints nothing."""
+"""Distances of a site's arrays from walls and each other, and the errors to expect (`livessl check`)."""
 
 from __future__ import annotations
 

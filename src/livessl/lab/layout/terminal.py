@@ -1,4 +1,4 @@
-"""A site as text: its floor plan in characters, and its distances and expected errors in tables."""
+"""The text of `livessl check`: floor plan in characters, distances and expected errors in tables."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Everything that can be computed about a site before it is built. It draws and prints nothing."""
+"""Computes a plan: error maps, aliasing, direct-to-reverberant ratios, advised moves. It draws and prints nothing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The error to expect at each place of a room, from geometry and room acoustics alone, without any recording.
+"""Predicts the error at each place of a room from geometry and reverberation alone, and finds better places.
 
 A plan rests on four facts. A pair measures a delay, so the gradient of the delay decides how well it resolves a place.
 Reverberation is noise to that delay, as strong as the direct sound at the critical distance. Microphones are never

@@ -1,4 +1,4 @@
-"""Warnings about a plan, each with the fault, its place and the cure."""
+"""Warnings of `livessl plan`, each with the cure: arrays in a line, near a wall, too small, or aliased."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A plan as readable text and as an object for JSON."""
+"""Words a plan: advice to move arrays, as text and as an object for JSON."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The interface of actions, which deliver alerts, and their registry `ACTIONS`. Only the types in use are imported."""
+"""The interface of actions that deliver alerts, their registry `ACTIONS`, and the TLS with which they connect."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Events that wait to be judged: a bounded queue, and the span of site time whose events did not fit into it."""
+"""A bounded queue of events that wait for the rules of alerts; what finds no room is read from the store later."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Delivers alerts to programs: each alert starts a program, which gets the alert as JSON on its standard input."""
+"""Delivers an alert to a program, which gets it as JSON on its standard input and accepts it by exit code 0."""
 
 from __future__ import annotations
 

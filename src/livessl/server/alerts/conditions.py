@@ -1,4 +1,4 @@
-"""Rules on conditions that last, such as an array that is lost: one alert when it begins, none until it has ended."""
+"""Rules on arrays and findings: one alert when an array has been lost, or a fault has been there, for a while."""
 
 from __future__ import annotations
 

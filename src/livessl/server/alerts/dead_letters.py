@@ -1,4 +1,4 @@
-"""Deliveries that were given up: they can be listed, delivered again, or dismissed."""
+"""Dead letters: deliveries that were given up; they can be listed, delivered again, or dismissed."""
 
 from __future__ import annotations
 

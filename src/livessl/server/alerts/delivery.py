@@ -1,4 +1,6 @@
-"""Delivers alerts, and sends an alert again after a failure until it is delivered or given up.
+"""Delivers alerts, and decides when one is sent again after a failure (backoff, jitter) and when it is given up.
+
+Defaults of attempts and waits are in `site/alert_models.py` (`AlertAction`).
 
 Each action has one `Deliverer`, which takes its alerts out of the outbox. The defaults of attempts and waits are in
 `livessl.site.alert_models.AlertAction`.

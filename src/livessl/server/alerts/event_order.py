@@ -1,4 +1,4 @@
-"""Judges events in the order of site time: first those that became final before a restart, then those that come.
+"""Decides in which order rules judge events: those final before a restart first, then by site time.
 
 It runs on the thread of the alerts, and does not know what the rules say.
 """

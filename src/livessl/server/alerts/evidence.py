@@ -1,4 +1,4 @@
-"""Makes the attachments of alerts: the picture, and the clip of the event when it has been cut."""
+"""Makes the attachments of alerts (picture and clip), and decides how long an alert waits for its clip."""
 
 from __future__ import annotations
 

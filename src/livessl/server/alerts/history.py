@@ -1,4 +1,4 @@
-"""Reads past events for alerts: events that were not judged before a restart, and events for the dry run of a rule."""
+"""Reads past events for alerts: those not judged before a restart, and those of a dry run of a rule."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The rules and actions of one site file, ready to judge and to deliver; a reload replaces them as a whole."""
+"""The rules and actions of one site file, ready to judge and deliver; a reload replaces them as a whole."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Makes alerts as JSON objects, each with a permanent key and a sentence for people."""
+"""Words alerts: their JSON, title and text, and the permanent key by which copies are recognized."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Delivers alerts by MQTT, with availability, a last will, and discovery by Home Assistant."""
+"""Delivers alerts by MQTT: topics, availability with a last will, and discovery by Home Assistant."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The outbox: alerts, their deliveries and the rules' states, in SQLite, so that none is lost in a restart.
+"""Stores alerts, their deliveries and the rules' states in SQLite, so that a restart loses none.
 
 The alerts of a batch of events are written in one transaction, together with the time up to which events have been
 judged. After a crash, later events are judged again, and the keys of alerts prevent a second entry. `delivery` sends

@@ -1,4 +1,4 @@
-"""The picture of an alert: the floor plan with its arrays and zones, and where the sound was, as PNG.
+"""Draws the picture of an alert as PNG: floor plan, arrays, zones, and the ellipse of the position.
 
 It is drawn from the alert alone, with the zones and poses of now, so it can be drawn at any time.
 """

@@ -1,4 +1,4 @@
-"""Restores alerts at the start of a server: alerts that the journal or the hub lacks are taken from the outbox."""
+"""Copies alerts at a start from the outbox into the journal and to the hub, where these lack them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Deletes alerts that are older than `store.retention_days` of the site file."""
+"""Retention of alerts: deletes those that are older than `store.retention_days`."""
 
 from __future__ import annotations
 

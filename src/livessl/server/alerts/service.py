@@ -1,5 +1,7 @@
 """The alerts of a running server: its rules judge events and conditions, and its deliverers send the alerts.
 
+It takes in events without waiting, and reports to `health` what keeps alerts from being delivered.
+
 The fusion thread only appends to a bounded queue. Events that find no room there are read from the event store later.
 """
 

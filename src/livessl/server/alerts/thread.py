@@ -1,4 +1,4 @@
-"""Runs the thread of the alerts, which judges events in turns and runs the deliverers. It contains no rules."""
+"""Runs the thread of the alerts: judging in turns, and deliveries. It contains no rules."""
 
 from __future__ import annotations
 

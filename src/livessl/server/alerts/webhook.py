@@ -1,4 +1,4 @@
-"""Webhooks: alerts as HTTP requests, signed as Standard Webhooks specifies. `delivery` sends failed ones again."""
+"""Delivers alerts as webhooks: HTTP requests, signed as Standard Webhooks specifies."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Prometheus metrics of the alerts."""
+"""Prometheus metrics of alerts: rules and deliveries."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""REST routes of the alerts: rules, alerts, dead letters, and the dry run."""
+"""REST routes of alerts: rules, arming, alerts with pictures, dead letters, dry run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Composition of the HTTP side: REST under /api/v1, WebSockets, /metrics, the dashboard, and who may use them."""
+"""Puts the HTTP side together: REST under /api/v1, WebSockets, /metrics, dashboard, and the order of middleware."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""AsyncAPI description of the two WebSockets, generated from the models of their messages and parameters."""
+"""The AsyncAPI description of the WebSockets, generated from the models of their messages and parameters."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Gate in front of the HTTP application: tokens, roles and limits of requests and WebSockets. It knows no route."""
+"""Checks access tokens: which role a request needs, what is refused (401, 403), and the longest body."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Prometheus metrics of kept and live sound."""
+"""Prometheus metrics of clips and of live listening."""
 
 from __future__ import annotations
 

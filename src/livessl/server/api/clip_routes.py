@@ -1,4 +1,4 @@
-"""REST routes of the clips of events: what there is, the sound itself, keeping and deleting it."""
+"""REST routes of clips: what there is, the sound as FLAC or WAV, keeping, deleting, and why a clip is missing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The contract of the API, continued: models of the clips of events."""
+"""API models of the clips of events, and of requests to keep or delete them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Encoder of estimates, events, tracks and array states as JSON-ready dictionaries; `livessl.schema` describes them."""
+"""Makes the JSON of events, updates, tracks and arrays: rounding, API version. `schema/values.py` describes it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Encoder of the nodes' reports as a part of the arrays' states; `schema/reports.py` describes it."""
+"""Makes the JSON of nodes' reports (levels, drift, machine) in the arrays' states."""
 
 from __future__ import annotations
 

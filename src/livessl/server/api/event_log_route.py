@@ -1,4 +1,4 @@
-"""REST: events in the order in which they were stored, for clients that resume."""
+"""REST route `GET event-log`: events in the order in which they were stored, for clients that resume."""
 
 from __future__ import annotations
 

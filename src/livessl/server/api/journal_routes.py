@@ -1,4 +1,4 @@
-"""REST: the journal of a server, which has what the history keeps besides events."""
+"""REST route of the journal: alerts, ended tracks, changes of arrays and of the configuration."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Models of the journal: what the history has besides events."""
+"""API models of the journal, which has what the history keeps besides events."""
 
 from __future__ import annotations
 

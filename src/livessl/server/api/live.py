@@ -1,4 +1,7 @@
-"""The WebSockets: messages as JSON, power maps as binary pictures, and the sound of a microphone."""
+"""The WebSockets of messages, power maps and live sound; disconnects a client that accepts nothing.
+
+`server/fanout.py` decides what a slow client misses, and `queries` reads the parameters.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""REST route of the server's last log lines."""
+"""REST route `GET log` of the server's last log lines."""
 
 from __future__ import annotations
 

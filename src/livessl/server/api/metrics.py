@@ -1,4 +1,4 @@
-"""Prometheus metrics, collected from the server's parts at each scrape."""
+"""Prometheus metrics: names and help of the server's, the events' and the arrays' counters."""
 
 from __future__ import annotations
 

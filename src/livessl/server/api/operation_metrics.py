@@ -1,4 +1,4 @@
-"""Prometheus metrics of the running program: its version, and whether it runs with what its site file says."""
+"""Prometheus metrics of the running program: version, and whether it runs with what its site file says."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Encoder of power maps as PNG pictures; it needs the standard library and numpy only."""
+"""Encodes power maps as PNG with their colour scale; that of the dashboard is in `static/colour-map.js`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The REST route `GET point`: the pan and tilt by which a camera faces a position or an event."""
+"""REST route `GET point`: pan and tilt by which a camera faces a position or event."""
 
 from __future__ import annotations
 

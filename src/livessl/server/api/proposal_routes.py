@@ -1,4 +1,4 @@
-"""REST routes of the poses: those in force, proposals of others, and how a proposal is accepted and undone."""
+"""REST routes of poses: those in force, proposals, accept and undo."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Middleware that restores from a proxy's headers what it hides: the client's address, the scheme, and the sub-path."""
+"""Restores what a reverse proxy hides (X-Forwarded-For, scheme, sub-path), from trusted proxies only."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Query parameters of REST and WebSockets: their meaning, and the answer to one that is wrong."""
+"""Checks query parameters of REST and WebSockets, and words what is wrong (422): unknown names, times, values."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""REST route that takes over a changed site file without a restart."""
+"""REST route `POST reload`: takes over a changed site file without a restart."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""REST: what the server holds, as JSON, PNG or float32. It computes no estimate."""
+"""REST routes of the site, arrays, tracks, health and maps; decides the `status` of health and its reasons."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""REST routes for setting up: the last sounds with their delays, and the verification by sounds at known places."""
+"""REST routes for setting up: last sounds with their delays, verification by claps at known places."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Models of the routes for setting up: sounds with their delays, verification, and proposals for the poses."""
+"""API models for setting up: sounds with delays, verification, proposals for poses, calibration."""
 
 from __future__ import annotations
 

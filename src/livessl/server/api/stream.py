@@ -1,4 +1,4 @@
-"""The live messages as server-sent events: what the WebSocket sends, for programs that have plain HTTP only."""
+"""The live messages as server-sent events (`GET stream`), with heartbeat and resumption by Last-Event-ID."""
 
 from __future__ import annotations
 

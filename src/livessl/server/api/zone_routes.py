@@ -1,4 +1,4 @@
-"""REST routes of the zones, of what tracks do in them, and of the floor plan's picture."""
+"""REST routes of zones, of what tracks do in them, and of the floor plan's picture."""
 
 from __future__ import annotations
 

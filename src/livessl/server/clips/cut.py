@@ -1,4 +1,6 @@
-"""One array's frames become one recording around an event: joined, with gaps filled by zeros and listed.
+"""Cuts the frames of one array into one recording around an event; gaps are filled by zeros and listed.
+
+How long before and after an event is kept is a setting: `ClipsConfig` in `site/server_models.py`.
 
 `record` writes it.
 """

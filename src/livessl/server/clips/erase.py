@@ -1,4 +1,4 @@
-"""Writes files through to the disk, and overwrites what is deleted."""
+"""Overwrites the content of files before they are deleted, and writes files through to the disk."""
 
 from __future__ import annotations
 

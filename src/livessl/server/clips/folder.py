@@ -1,4 +1,4 @@
-"""Stores and deletes clips, each a folder of recordings with one JSON file; `service` sets the limits of age and bytes.
+"""Stores and deletes clips, each a folder with recordings and `clip.json`; `service` sets the limits.
 
 A clip is written into a folder of another name first, so that a killed server leaves no half of one.
 """

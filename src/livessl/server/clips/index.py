@@ -1,4 +1,4 @@
-"""An index of the stored clips: age and size of each, and whether it may be deleted, without reading its file.
+"""Index of the stored clips: age, size, kept or not; decides which are deleted first for lack of room.
 
 It reads and writes no files. `folder` owns the clips, and calls this with its lock held.
 """

@@ -1,4 +1,4 @@
-"""Passes the sound of single microphones to people who listen live. Nothing is stored."""
+"""Passes live sound of single microphones to people who listen. Nothing is stored."""
 
 from __future__ import annotations
 

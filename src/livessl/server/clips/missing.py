@@ -1,4 +1,4 @@
-"""Remembers why events have no clip, over a restart, too: a line for each in a file beside the clips."""
+"""Remembers why events have no clip, also after a restart (`missing.jsonl`)."""
 
 from __future__ import annotations
 

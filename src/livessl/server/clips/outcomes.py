@@ -1,4 +1,4 @@
-"""The outcomes of events that should have a clip: counts since the start, and why single events have none."""
+"""Counts clips that were written, deleted or left out, and notes why an event has none."""
 
 from __future__ import annotations
 

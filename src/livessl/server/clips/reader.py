@@ -1,4 +1,4 @@
-"""Reads and checks `clip.json`, the file that describes the recordings of an event. No other module reads it.
+"""Reads and checks `clip.json`, which describes the recordings of an event. No other module reads it.
 
 All fields are checked before use, because another release may have written the file, or a disk may have damaged it.
 """

@@ -1,4 +1,4 @@
-"""The newest frames of all arrays, in memory, for clips that are cut after the event. It knows no event."""
+"""Keeps the newest frames of all arrays in memory, for clips that are cut after the event. It knows no event."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The clips of a running server: the fusion thread hands over frames and events, a thread of low priority writes."""
+"""Decides which events get a clip and how long clips are kept (age, bytes); a thread of low priority writes them."""
 
 from __future__ import annotations
 

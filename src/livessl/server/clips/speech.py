@@ -1,4 +1,4 @@
-"""A detector of speech in recordings. With `privacy: no-speech` nothing is stored before it has examined them.
+"""Decides whether there is speech in a recording, before `privacy: no-speech` lets anything be stored.
 
 The voice activity detector runs in a process of its own (`speech_main`): its library holds the interpreter for
 milliseconds, which would delay the localization. Samples go there through a pipe, and never to a disk.

@@ -1,4 +1,4 @@
-"""The process that has the voice activity detector: `python -m livessl.server.clips.speech_main`.
+"""The process that runs the voice activity detector for `speech`: samples in, probabilities out.
 
 For each channel it reads a head and the samples from its standard input, and writes the probabilities of speech to its
 standard output. It ends when its input does, and so with the server. It stores nothing.

@@ -1,4 +1,4 @@
-"""Reads what locating an event again needs from its clip: the set-up at that time, the frames and their samples.
+"""Reads from a clip what locating its event again needs, and words why an event cannot be located again.
 
 `reader` has checked what every clip says; what only locating again needs is checked here.
 """

@@ -1,4 +1,4 @@
-"""Errors that stand in the way of clips, for the log and for `GET health`."""
+"""Errors that stand in the way of clips (disk, folder, detector), for the log and for `GET health`."""
 
 from __future__ import annotations
 

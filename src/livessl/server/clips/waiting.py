@@ -1,4 +1,4 @@
-"""Events that wait for their clips, in the order in which they came, but refused ones last."""
+"""Queues events that wait for their clips, refused ones last."""
 
 from __future__ import annotations
 

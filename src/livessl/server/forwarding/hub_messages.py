@@ -1,4 +1,4 @@
-"""Messages of a site for the hub: those messages for subscribers that the hub needs are put into the outbox."""
+"""Chooses which messages of a site go to the hub, and puts them into the outbox."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The link of a site's server to a hub: a thread sends what waits in the outbox to a JetStream stream, in order.
+"""Sends a site's outbox to the hub through NATS JetStream, again after a failure, and reports on the site.
 
 No other thread waits for it. It sends a window of messages at a time and goes on when the stream has acknowledged all
 of them. After a failure it sends again from the first one without an acknowledgement; ids prevent duplicates.

@@ -1,4 +1,4 @@
-"""The outbox: messages for the hub, in order, in the database of the history, until the stream has acknowledged them.
+"""Stores messages for the hub in the history's database until the stream has acknowledged them; drops the oldest.
 
 What a final pass stores and what it sends are written in one transaction, so neither exists without the other.
 """

@@ -1,4 +1,4 @@
-"""Names in NATS that sites and hubs agree on, and how both connect to it."""
+"""Names in NATS (subjects, stream, consumer, message ids), and how sites and hubs connect to it."""
 
 from __future__ import annotations
 

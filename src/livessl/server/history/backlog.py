@@ -1,4 +1,4 @@
-"""Holds what waits to be written into the history, in order, bounded and retried: no caller waits for a database."""
+"""Holds what waits to be written into the history, retries while the database is away, and gives up the oldest."""
 
 from __future__ import annotations
 

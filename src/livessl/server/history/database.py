@@ -1,4 +1,4 @@
-"""Connections to the database of the history: SQLite in memory or in a file, or PostgreSQL, with its tables made.
+"""Connects to the history's database (SQLite or PostgreSQL): time-outs, migrations, and the words of its errors.
 
 `records` has the statements.
 """

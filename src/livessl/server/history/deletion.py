@@ -1,4 +1,4 @@
-"""Deletion of old events and entries, in small transactions that give way to new events."""
+"""Deletes old events and entries in small transactions that give way to new events."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The number of stored events, which the metrics show."""
+"""Counts the stored events without reading them all, for the metrics."""
 
 from __future__ import annotations
 

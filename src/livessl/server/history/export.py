@@ -1,4 +1,4 @@
-"""Exports events as CSV, JSON Lines or Parquet, in parts, so that memory does not grow with the number of events."""
+"""Exports events as CSV, JSON Lines or Parquet: their columns, a page at a time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Counts the events in each cell of a floor plan, in the database."""
+"""Counts events in each cell of the floor plan (heat map), in the database."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The journal: what is kept besides events, as alerts, tracks, and changes of arrays and of the configuration."""
+"""The journal's table: stores, lists and deletes the entries of each kind. `server/journal.py` writes them."""
 
 from __future__ import annotations
 

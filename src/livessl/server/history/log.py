@@ -1,4 +1,4 @@
-"""The events in the order in which they were stored, for clients that must not miss one while they are away.
+"""The log of events in the order of storing, and positions in it, for clients that resume.
 
 An event that is stored again, because sound has arrived late, appears once: where its last version was stored.
 """

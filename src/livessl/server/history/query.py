@@ -1,4 +1,4 @@
-"""A search for events and the pages of its answer, as values; it knows no database."""
+"""A search for events as values: filters, cursors of pages; it knows no database."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The statements that write events, and that find those which may change, in a transaction that the caller ends."""
+"""SQL statements that write and delete events, and find early ones, in the caller's transaction."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The statements that find events; both databases answer them from indices."""
+"""The SQL statements that find events by filters and words, a page at a time."""
 
 from __future__ import annotations
 

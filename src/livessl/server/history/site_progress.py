@@ -1,4 +1,4 @@
-"""State that a restarted server needs beside the events: how far the final pass came, and the disabled arrays."""
+"""Stores what a restarted server needs besides events: progress of the final pass, clocks, disabled arrays."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tables of the history, the same for SQLite and PostgreSQL, and an event's columns.
+"""Tables and columns of the history, and which words of an event a search looks through.
 
 The migrations make these tables; a test compares both. A new column or table needs a migration.
 """

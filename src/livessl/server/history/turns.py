@@ -1,4 +1,4 @@
-"""A fair lock, for the one connection that writes."""
+"""A fair lock for the one connection that writes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-// Requests to the server, with an access token where the server requires one; the browser tab keeps the token.
+// Requests to the server with an access token, their time-outs, and the words of a refusal; the tab keeps the token.
 
 const STORAGE_KEY = "livessl-token";
 /** Longest wait for an answer, in milliseconds. */

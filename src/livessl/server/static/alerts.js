@@ -1,4 +1,4 @@
-// The alerts panel: each rule with its state and a button to arm or disarm it, and the last alerts.
+// The alerts panel: each rule with its state, a button to arm or disarm it, and the last alerts.
 
 import { el, write } from "./dom.js";
 import { counted, when } from "./format.js";

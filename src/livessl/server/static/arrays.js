@@ -1,4 +1,4 @@
-// The arrays panel: a card per array with its state, its level beside the activity threshold, and the age of its data.
+// The arrays panel: a card per array with its state and reason, its level beside the activity threshold, and a switch.
 
 import { stateIcon } from "./array-icons.js";
 import { el, write } from "./dom.js";

@@ -1,4 +1,4 @@
-// Power maps as coloured images that fade with age; their colour scale changes evenly in lightness.
+// The colours of power maps (their scale for light and dark), and how maps fade with age.
 
 /** Anchors [place, lightness, chroma, hue in degrees] in OKLCh, a colour space in which equal steps look equal. */
 const SCALES = {

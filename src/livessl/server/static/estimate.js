@@ -1,4 +1,4 @@
-// The readout of the latest estimate: where, how certain, from which arrays, and how old it is.
+// The readout of the latest estimate: position, uncertainty, confidence, arrays, and how old it is.
 
 import { find, write } from "./dom.js";
 import { ago, bearing, number, percent, position, width } from "./format.js";

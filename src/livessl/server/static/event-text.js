@@ -1,4 +1,4 @@
-// The contents of an event's row: one line that sums it up, and the details that open below it.
+// Words an event: the line of its row that sums it up, and the details that open below it.
 
 import { el } from "./dom.js";
 import { milliseconds, number, percent, position, stageText, verdict, when, width } from "./format.js";

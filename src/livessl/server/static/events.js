@@ -1,4 +1,4 @@
-// The list of events, newest first: rows that can be selected and opened, by mouse and keyboard.
+// The list of events, newest first: how many rows it keeps, and their selection by mouse and keyboard.
 
 import { el } from "./dom.js";
 import { details, summary } from "./event-text.js";

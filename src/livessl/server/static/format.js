@@ -1,4 +1,4 @@
-// Numbers, times and positions as text.
+// Words numbers, times, durations, positions, bearings and latency stages.
 
 const MINUS = "\u2212";
 const NARROW_SPACE = "\u202f";

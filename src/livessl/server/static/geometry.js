@@ -1,4 +1,4 @@
-// Shapes of uncertainty and direction, computed from numbers alone.
+// Computes ellipses and ellipsoids of 95 % uncertainty, and rays of direction, from numbers alone.
 
 /** 95 % quantiles of the chi-square distribution with two degrees of freedom, -2 ln 0.05, and with three. */
 const CHI2_95 = 5.991;

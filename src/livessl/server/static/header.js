@@ -1,4 +1,4 @@
-// The bar at the top: site, mode, privacy, latency, array count, server time and connection; and the notices below it.
+// The bar at the top: site, mode, latency, time, and the words of the connection and its loss; the notices below it.
 
 import { find, write } from "./dom.js";
 import { clock, counted, duration, milliseconds, stageText } from "./format.js";

@@ -1,4 +1,4 @@
-// The history's page: reads the filters, loads the events and the heat map that they admit, and marks an event.
+// The history's page: filters, pages of events, heat map and exports.
 
 import { get, getStream, onTokenNeeded, refusal, useToken } from "./access.js";
 import { colourScale, paintScale } from "./colour-map.js";

@@ -1,4 +1,4 @@
-// Places for labels, so that none covers another: computed from boxes alone.
+// Decides where labels stand on a plan, so that none covers another: computed from boxes alone.
 
 /** Directions from an anchor to its label, as [right, down], the best first. */
 const AROUND = [[0, 1], [0, -1], [1, 0], [-1, 0], [1, 1], [-1, 1], [1, -1], [-1, -1]];

@@ -1,4 +1,4 @@
-// The WebSocket that delivers power maps; it is open only while the page is visible, because maps cost the server time.
+// The WebSocket that delivers power maps, and their binary form; it is open only while the page is visible.
 
 import { protocols } from "./access.js";
 

@@ -1,4 +1,4 @@
-// What the page knows, collected from the server's messages; the panels and plans show it. It touches no element.
+// The page's state, collected from the server's messages: arrays, estimates, tracks, events. It touches no element.
 
 import { utc } from "./format.js";
 import { zonesOf } from "./plan-zones.js";

@@ -1,4 +1,4 @@
-// The layer of a plan that shows the arrays: microphones, names, states, and which ones receive sound.
+// Draws the arrays on a plan: microphones, names, states, and which ones receive sound.
 
 import { together } from "./labels.js";
 import { ORDER } from "./plan-labels.js";

@@ -1,4 +1,4 @@
-// Layers of a plan that show results: estimates with their uncertainty, directions, tracks and past estimates.
+// Draws results on a plan: estimates with their ellipses, directions, tracks and past estimates.
 
 import { number } from "./format.js";
 import { direction, ellipse, ellipse95, ellipsoid95, rayEnd } from "./geometry.js";

@@ -1,4 +1,4 @@
-// Layers of a plan that show the room: its faces, power maps and grid, and the walls and axes of the fixed views.
+// Draws the room on a plan: its faces, power maps and grid, and the walls and axes of the fixed views.
 
 import { number } from "./format.js";
 import { opacity } from "./colour-map.js";

@@ -1,4 +1,4 @@
-// Layers of a plan that show the zones, the one that is being drawn, and the picture of the floor plan.
+// Draws the zones on a plan, the one that is being drawn, and the picture of the floor plan.
 
 import { ORDER } from "./plan-labels.js";
 import { SMALL } from "./plan-style.js";

@@ -1,4 +1,4 @@
-// Locating an event again from its recordings, at the end of them: both answers beside each other, and on the plans.
+// Has the server locate an event again from its recordings; shows both answers beside each other and on the plans.
 
 import { postLong, refusal } from "./access.js";
 import { el, write } from "./dom.js";

@@ -1,4 +1,4 @@
-// An estimate of the server's time from the browser's clock and the time stamps of messages.
+// Estimates the server's time from the browser's clock and the time stamps of messages.
 
 /** Time span, in milliseconds, of the stamps in use: some message in it was not delayed, and clocks drift little in it. */
 const WINDOW_MS = 60000;

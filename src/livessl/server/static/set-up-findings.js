@@ -1,4 +1,4 @@
-// What the doctor says, as items of lists.
+// The findings of the doctor as items of lists: what is wrong, at which input, and the cure.
 
 import { el } from "./dom.js";
 

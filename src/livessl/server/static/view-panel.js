@@ -1,4 +1,4 @@
-// The panel beside the floor plan: side elevation, front elevation or 3-D view; the browser keeps which one.
+// The panel beside the floor plan: chooses side elevation, front elevation or 3-D view, which the browser keeps.
 
 import { find, write } from "./dom.js";
 import { number } from "./format.js";

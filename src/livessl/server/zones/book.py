@@ -1,4 +1,4 @@
-"""The zones of a running server: operators change those that they have drawn, and all parts see it at once."""
+"""Holds the zones in force, which operators draw, change and delete; words why a change is refused."""
 
 from __future__ import annotations
 

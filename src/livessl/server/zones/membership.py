@@ -1,4 +1,4 @@
-"""Probabilities that a position lies in zones, from its covariance: all zones together. Pure numerics."""
+"""Computes the probability that an uncertain position lies in a zone, from its covariance. Pure numerics."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Decides when tracks enter and leave zones, or loiter there, with hysteresis so that no state flickers at an edge."""
+"""Decides when a track enters or leaves a zone or loiters there, with hysteresis."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The zones of a site at one moment, and which of them hold a position. Values in, values out."""
+"""Decides from which probability on an event names a zone, and when it lies in an excluded zone."""
 
 from __future__ import annotations
 

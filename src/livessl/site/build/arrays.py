@@ -1,4 +1,4 @@
-"""The arrays of a site: shapes and poses become absolute positions, and joined arrays become one."""
+"""Decides where the microphones are (pose, geometry file, calibration, joint arrays), and the speed of sound."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Calibrations of a site: what is stored of measured or typed poses, and the site with them."""
+"""Makes from measured or typed poses what a calibration stores, and the site with these poses."""
 
 from __future__ import annotations
 

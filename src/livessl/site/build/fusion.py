@@ -1,4 +1,4 @@
-"""The fusion of a site: estimator, parameters and clock offsets. It imports everything that locates."""
+"""Makes the fusion of a site: estimator, parameters, clock offsets. It imports everything that locates."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Inputs of the site's devices for findings about channels."""
+"""Adds the device's input to findings about channels."""
 
 from __future__ import annotations
 

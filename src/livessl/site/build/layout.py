@@ -1,4 +1,4 @@
-"""Findings that follow from the site file alone: ambiguous layouts of microphones, and grids that are too coarse."""
+"""Findings from the site file alone: ambiguous layouts of microphones, and grids that are too coarse."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The pipeline of a device, or of a recording that is played in its place. It imports nothing that locates."""
+"""Makes the pipeline of a device, or of a recording in its place, from the site. It imports nothing that locates."""
 
 from __future__ import annotations
 

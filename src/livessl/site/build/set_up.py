@@ -1,4 +1,4 @@
-"""Examines a site's set-up by sounds: faults, with the inputs of the site's devices, and the poses of the arrays."""
+"""Runs doctor and calibration on a site: findings with inputs, verification, measured and refined poses."""
 
 from __future__ import annotations
 
