@@ -72,5 +72,5 @@ def test_a_file_without_a_head_is_named(tmp_path: Path) -> None:
 
 def test_parts_are_in_the_order_of_the_layers() -> None:
     titles = re.findall(r"^## (\S+)$", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
-    layers = ["cli/", "lab/", "server/", "capture/", "simulation/", "recordings/", "site/", "core/stream/", "core/locate/"]
+    layers = ["cli/", "lab/", "server/", "capture/", "simulation/", "recordings/", "site/", "core/stream/", "core/"]
     assert [title for title in titles if title in layers] == layers

@@ -1,4 +1,4 @@
-"""Keeps a node's frames, in memory or in files, until the server needs them no more; drops the oldest if it is full.
+"""Buffers a node's frames, in memory or in files, until the server needs them no more; drops the oldest if it is full.
 
 The order of sending is decided in `outbox`.
 

@@ -1,4 +1,4 @@
-"""Stores what a hub keeps of its sites (events, tracks, arrays, alerts), each message once and in order.
+"""Stores what a hub keeps of its sites (events, tracks, arrays, alerts): each message exactly once and in order.
 
 The number of the last message that was taken in from each outbox is in the database, and is raised in the transaction
 that stores the message. So it does not matter how often a message comes, and to which hub.

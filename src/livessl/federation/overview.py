@@ -1,4 +1,4 @@
-"""Decides when a site counts as away at the hub, and makes the overview of a site as the API describes it."""
+"""Decides when a site counts as away (offline) at the hub, and makes the overview of a site that the API describes."""
 
 from __future__ import annotations
 

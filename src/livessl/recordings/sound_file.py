@@ -1,4 +1,4 @@
-"""Opens, reads and writes WAV and FLAC files; reads damaged ones as far as they go, and survives a sudden end.
+"""Opens, reads and writes WAV and FLAC files (the list of formats); reads damaged ones as far as they go.
 
 Errors of libsndfile end here: they become a `DeviceError` or an `OSError` with a sentence for the user.
 """

@@ -1,4 +1,4 @@
-"""The fusion server as one process: starts and stops the parts that `assembly` lists, and ends if a thread fails."""
+"""The fusion server as one process: start-up and shutdown of the parts that `assembly` lists."""
 
 from __future__ import annotations
 

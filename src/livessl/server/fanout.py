@@ -1,4 +1,4 @@
-"""Numbers messages and fans them out to subscribers, with filters; decides what a slow client misses (`gap`)."""
+"""Fans numbered messages out to subscribers: filters, rate limits, and what a slow client misses (`gap`)."""
 
 from __future__ import annotations
 

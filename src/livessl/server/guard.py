@@ -1,4 +1,4 @@
-"""Decides by its key whether a node may connect to the nodes' port (CURVE, ZAP), on a thread of its own.
+"""Decides by its key whether a node may connect to the nodes' port (CURVE encryption, ZAP), on a thread of its own.
 
 What a connected node is refused for is decided in `ingest`.
 

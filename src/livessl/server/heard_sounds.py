@@ -1,4 +1,4 @@
-"""Keeps the last sounds with the delays at each array, from which set-ups are verified and calibrated."""
+"""Keeps the latest sounds with the delays that the arrays observed, from which set-ups are calibrated."""
 
 from __future__ import annotations
 

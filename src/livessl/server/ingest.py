@@ -1,4 +1,4 @@
-"""Decides at a node's greeting whether it is refused, and words that; acknowledges frames, and counts lost ones.
+"""Decides at a node's greeting whether it is refused, and words that; acknowledges frames, drops duplicates.
 
 It is the protocol without a socket: `receiver` has the socket, `guard` checks keys, and `wire` decodes messages.
 """

@@ -1,4 +1,4 @@
-"""Reports to systemd that the server lives, as long as its fusion thread takes turns, and its condition in words."""
+"""Reports to systemd that the server lives (watchdog) while its fusion thread takes turns, and its condition."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Lists every setting in effect with the source of its value (`livessl config show`)."""
+"""Lists every setting in effect with the origin of its value: file, default or calibration (`livessl config show`)."""
 
 from __future__ import annotations
 

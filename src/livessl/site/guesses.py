@@ -1,4 +1,4 @@
-"""Guesses what was meant by a wrong value: another unit, swapped axes, inputs that do not exist, addresses.
+"""Guesses what a wrong value meant: another unit (mm, Fahrenheit), swapped axes, inputs that do not exist, addresses.
 
 Guesses come with the values to write instead. A value that is certainly wrong is a fault, and its guess is the cure; a
 value that is only unlikely is a warning.

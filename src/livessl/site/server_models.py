@@ -1,4 +1,4 @@
-"""Keys and defaults of `server` and `store` in the site file: ports, TLS, sinks, clips, history and retention.
+"""Keys and defaults of `server` and `store` in the site file: addresses and ports, TLS, sinks, clips, retention.
 
 Those of `server.hub` are in `hub_models`.
 """

@@ -1,4 +1,4 @@
-"""Meters the level (RMS, peak) and the faults of each input, over the last second and since the start."""
+"""Meters the level (RMS and peak, dBFS) and the faults of each input, over the last second and since the start."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Decides when a finding appears and when it ends (hysteresis), so that it does not flicker with single sounds."""
+"""Decides when a finding appears and ends (hysteresis, debouncing), so that it does not flicker with single sounds."""
 
 from __future__ import annotations
 

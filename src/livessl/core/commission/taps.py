@@ -1,4 +1,4 @@
-"""Detects taps on microphones (`levels --tap`): sudden peaks of one input, far above all other inputs."""
+"""Decides which microphone was tapped (`levels --tap`): sudden peaks of one input, far above all other inputs."""
 
 from __future__ import annotations
 

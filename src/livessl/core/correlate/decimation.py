@@ -1,4 +1,4 @@
-"""Lowers the sampling rate of an array's sound (anti-alias low-pass, decimation) to what its band needs."""
+"""Resamples an array's sound (anti-alias low-pass, decimation) to the lower sampling rate that its band needs."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Decides when an event begins and ends, and keeps its state until it is reported. It locates nothing.
+"""Decides when an event begins and ends (hang-over, longest event), and keeps its state until it is reported.
 
-Its id, status and reason are made in `verdict`.
+It locates nothing. The event's id, status and reason are made in `verdict`.
 
 Its states are these.
 

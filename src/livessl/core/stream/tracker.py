@@ -1,4 +1,4 @@
-"""Starts, joins, confirms and ends tracks: a Kalman filter for each source, with gates. Time is an argument.
+"""Decides which track an estimate joins, and starts, confirms and ends tracks: a Kalman filter for each source, gates.
 
 The estimates of one time are assigned to the tracks for which all assignments together are most likely, so that two
 sources that cross keep their tracks by their velocities. A source that turned round in a pause is also searched for at

@@ -1,4 +1,4 @@
-"""Delivers alerts by Apprise: as e-mail, or to one of a hundred chat and push services."""
+"""Delivers alerts by Apprise: as e-mail, or to chats such as Slack and a hundred other services."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Makes the JSON of events, updates, tracks and arrays: rounding, API version. `schema/values.py` describes it."""
+"""Serializes events, updates, tracks and arrays as JSON: rounding, API version. `schema/values.py` describes it."""
 
 from __future__ import annotations
 

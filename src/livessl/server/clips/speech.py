@@ -1,4 +1,4 @@
-"""Decides whether there is speech in a recording, before `privacy: no-speech` lets anything be stored.
+"""Decides whether there is speech in a recording (voice activity, VAD), before `privacy: no-speech` stores anything.
 
 The voice activity detector runs in a process of its own (`speech_main`): its library holds the interpreter for
 milliseconds, which would delay the localization. Samples go there through a pipe, and never to a disk.

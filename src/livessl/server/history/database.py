@@ -1,4 +1,4 @@
-"""Connects to the history's database (SQLite or PostgreSQL): time-outs, migrations, and the words of its errors.
+"""Connects to the history's database (SQLite or PostgreSQL): time-outs, migrations (upgrades), words of its errors.
 
 `records` has the statements.
 """
