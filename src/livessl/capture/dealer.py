@@ -1,6 +1,6 @@
 """The ZeroMQ socket of a node: how soon it tries to reconnect, and how much it queues. It never blocks.
 
-`link` greets the server and notes that it is unreachable; `server/ingest.py` decides whether a node is accepted.
+`link` greets the server and notes that it is unreachable; `server/ingest.py` accepts or refuses the node.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """A node's link to the server: greeting, acknowledgements, when the server counts as unreachable, and reconnection.
 
-It logs why a server refuses the node; the reason is made in `server/ingest.py`. It never blocks.
+It logs the reason for which a server refuses the node, as `server/ingest.py` sends it. It never blocks.
 
 Live sound is sent first. Kept frames follow in order of time in the remaining bandwidth, with only a few frames that
 are not acknowledged.

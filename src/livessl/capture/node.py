@@ -1,7 +1,4 @@
-"""Runs a capture node: the sound of a device or of recordings goes through its pipelines to the server.
-
-It words the status that systemd shows of a node, and decides for how long a replay waits for the server.
-"""
+"""A capture node: one audio device, or recordings played in its place, its arrays, and the link to the server."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Decides by its key whether a node may connect to the nodes' port (CURVE encryption, ZAP), on a thread of its own.
 
-What a connected node is refused for is decided in `ingest`.
+`ingest` answers the greetings of connected nodes, and refuses some.
 
 pyzmq's `ThreadAuthenticator` does not serve here. Its callback gets the key but not the caller's address, which the
 list of refusals needs, and it does not report that its thread has failed. Handshakes that fail before a key is shown

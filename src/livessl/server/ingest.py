@@ -1,7 +1,4 @@
-"""Decides at a node's greeting whether it is refused, and words that; acknowledges frames, drops duplicates.
-
-It is the protocol without a socket: `receiver` has the socket, `guard` checks keys, and `wire` decodes messages.
-"""
+"""The server's side of the link to the nodes: greetings, sequence numbers, acknowledgements. It owns no socket."""
 
 from __future__ import annotations
 

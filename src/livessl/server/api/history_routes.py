@@ -1,4 +1,4 @@
-"""REST routes of the history: search for events, exports (CSV, JSON Lines, Parquet), heat map."""
+"""REST: the history of events, its exports, and a heat map of it."""
 
 from __future__ import annotations
 

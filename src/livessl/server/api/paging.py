@@ -1,4 +1,4 @@
-"""Pages of events (limit, cursor), and answers by ETag (304): shared by the histories of a server and of a hub."""
+"""Pages of events, and answers that a client may have already: shared by the histories of a server and of a hub."""
 
 from __future__ import annotations
 
