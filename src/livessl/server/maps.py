@@ -1,4 +1,4 @@
-"""Draws power maps on demand, on a thread of its own: the newest one, or one for each window to watchers.
+"""Draws power maps on demand, on a thread of its own, and packs them as binary pictures for those who watch.
 
 `newest` returns one map once; `watching` delivers the maps of every window. A window holds the evidence from which maps
 are drawn, not the maps, so it costs nothing until it is drawn.

@@ -1,4 +1,4 @@
-"""Counts clips that were written, deleted or left out, and notes why an event has none."""
+"""Counts the clips that were written, deleted or left out, and notes why an event has none."""
 
 from __future__ import annotations
 
