@@ -1,4 +1,4 @@
-"""Decides that a device hangs, stalls or floods the log, and the words for it. It reads no clock.
+"""Decides when a device hangs, stalls or floods the log, and words that problem. It reads no clock.
 
 The time limits are here; `sound_device` restarts the device's process, and `portaudio` words why a device does not
 open.

@@ -1,4 +1,4 @@
-"""Shapes and poses of arrays (roll, pitch, yaw), azimuth and elevation, the grid, and the speed of sound by temperature.
+"""Shapes and poses of arrays (roll, pitch, yaw), azimuth and elevation, the grid, speed of sound by temperature.
 
 Coordinates are in metres, right-handed, with z up and a corner of the room at the origin.
 """
