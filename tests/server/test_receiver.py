@@ -13,6 +13,7 @@ from livessl import wire
 from livessl.capture.link import Link
 from livessl.clock import SystemClock
 from livessl.core.types import Frame
+from livessl.server.admission import OTHER_SITE, OTHER_VERSION
 from livessl.server.inlet import QUEUE_MESSAGES
 from livessl.server.receiver import BindError, Joined, Left, Receiver
 from small_site import frame, mark, site_of, wait_until
@@ -80,6 +81,20 @@ def test_malformed_messages_hinder_no_other_node() -> None:
             assert_works(receiver, link, 10 * turn + 1)
         wait_until(lambda: receiver.ingest.malformed >= 0.9 * sent, "the count of what was refused")
         assert receiver.failure is None
+
+
+def test_refused_greetings_are_counted_by_their_cause() -> None:
+    newer = bytearray(wire.encode(HELLO))
+    newer[4] = wire.VERSION + 1
+    unknown = wire.Hello("lab-pc", "run-2", {"cellar": 16000.0})
+    with receiving() as receiver, stranger(receiver) as socket:
+        for data in (bytes(newer), bytes(newer), wire.encode(unknown)):
+            socket.send(data)
+        assert socket.poll(5000), "there is no reply"
+        assert socket.recv()[4] == wire.VERSION + 1
+        wait_until(lambda: receiver.refusals.count("nodes") == 3, "the count of refusals")
+        assert receiver.refusals.counts() == {("nodes", OTHER_VERSION): 2, ("nodes", OTHER_SITE): 1}
+        assert {refused.who for refused in receiver.refusals.known()} == {"node 'lab-pc'"}
 
 
 def test_oversized_message_disconnects_only_its_sender() -> None:
