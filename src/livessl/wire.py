@@ -63,7 +63,7 @@ __all__ = [
 
 VERSION: Final = 2
 """Version of the format. Raise it with a change of the bytes that nodes and servers of the version before cannot read.
-A server then refuses the greeting of a node of another version, and says so in an acknowledgement of that version
+A server then refuses the greeting of a node of another version by an acknowledgement in that version
 (`FIRST_LASTING_VERSION`); it drops the node's other messages. A new section of a mark needs no higher version, because
 servers skip unknown ones."""
 

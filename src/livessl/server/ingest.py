@@ -77,9 +77,9 @@ class Peer:
 class Received:
     """The result of one message.
 
-    `joined` is set by a new run, `greeted` by a known run whose backlog changed. `welcome` lists the
-    extensions that the server reads, and `offer` announces requests for frames. Both are sent before the reply.
-    `refused` is set by a greeting that is refused; the reply, in the node's version of the format, says so.
+    `joined` is set by a new run, `greeted` by a known run whose backlog changed. `welcome` lists the extensions that
+    the server reads, and `offer` announces requests for frames. Both are sent before the reply. `refused` is set by a
+    refused greeting; the reply then contains the reason, in the version of the format that the node reads.
     """
 
     message: Message | None = None

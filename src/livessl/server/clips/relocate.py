@@ -364,7 +364,7 @@ class Relocator:
             raise BusyError("the server is overloaded, and live sound comes first; try again when it is not")
 
     def _at_leisure(self, work: Callable[[], Relocation]) -> Relocation:
-        """Call `work` on a new thread of low priority, wait for its end or for `stop`, and raise the error of `work`."""
+        """Call `work` on a new thread of low priority, wait for its end or for `stop`, and raise its error."""
         made: list[Relocation] = []
         failed: list[BaseException] = []
         self._ended = ended = threading.Event()
