@@ -10,6 +10,7 @@ import pytest
 import zmq
 
 from livessl import wire
+from livessl.capture.dealer import Dealer
 from livessl.capture.link import Link
 from livessl.clock import SystemClock
 from livessl.core.types import Frame
@@ -95,6 +96,33 @@ def test_refused_greetings_are_counted_by_their_cause() -> None:
         wait_until(lambda: receiver.refusals.count("nodes") == 3, "the count of refusals")
         assert receiver.refusals.counts() == {("nodes", OTHER_VERSION): 2, ("nodes", OTHER_SITE): 1}
         assert {refused.who for refused in receiver.refusals.known()} == {"node 'lab-pc'"}
+
+
+class NewerDealer(Dealer):
+    """The connection of a node that has the next version of the format, with the same greeting and acknowledgement."""
+
+    def send(self, data: bytes) -> bool:
+        return super().send(data[:4] + bytes([wire.VERSION + 1]) + data[5:])
+
+    def receive(self) -> bytes | None:
+        data = super().receive()
+        if data is not None:
+            assert data[4] == wire.VERSION + 1
+            data = data[:4] + bytes([wire.VERSION]) + data[5:]
+        return data
+
+
+def test_node_of_another_version_learns_why_it_is_refused(caplog: pytest.LogCaptureFixture) -> None:
+    with receiving() as receiver:
+        link = Link(receiver.endpoint, HELLO, CLOCK, dealer=NewerDealer(receiver.endpoint))
+        try:
+            link.wait_connected(lambda: False)
+        finally:
+            link.close(bye=False)
+        assert "the node runs a newer livessl than the server" in str(link.refused)
+        assert "its node 'lab-pc' is refused" in str(receiver.ingest.problem_of("north"))
+    assert "refuses this node: the node runs a newer livessl" in caplog.text
+    assert "nodes: node 'lab-pc' was refused: the node runs a newer livessl" in caplog.text
 
 
 def test_oversized_message_disconnects_only_its_sender() -> None:
