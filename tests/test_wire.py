@@ -185,6 +185,13 @@ def test_error_about_a_header_names_the_expected_value() -> None:
     assert "known kind of message, got 9" in refusal(data[:5] + b"\x09" + data[6:])
 
 
+def test_acknowledgement_is_encoded_for_another_version() -> None:
+    ack = wire.Ack("run-1", {}, refused="run the same livessl")
+    data = encode(ack, 3)
+    assert "expected wire version 2, got 3" in refusal(data)
+    assert decode(data[:4] + b"\2" + data[5:]) == ack
+
+
 def test_oversize_is_refused_before_it_is_read() -> None:
     said = refusal(bytes(wire.MAX_MESSAGE_BYTES + 1))
     assert f"expected at most {wire.MAX_MESSAGE_BYTES}" in said

@@ -30,6 +30,7 @@ from livessl.wire_messages import (
     Bye,
     Hello,
     JsonMessage,
+    OtherVersionError,
     Request,
     Welcome,
     WireError,
@@ -51,6 +52,7 @@ __all__ = [
     "Ack",
     "Bye",
     "Hello",
+    "OtherVersionError",
     "Request",
     "Welcome",
     "WireError",
@@ -62,8 +64,10 @@ __all__ = [
 ]
 
 VERSION: Final = 2
-"""Version of the format. Raise it with a change of the bytes that nodes and servers of the version before cannot read,
-for the sides then refuse each other. A new section of a mark needs no higher version: servers skip unknown ones."""
+"""Version of the format. Raise it with a change of the bytes that nodes and servers of the version before cannot read.
+A server then refuses the greeting of a node of another version by an acknowledgement in that version
+(`FIRST_LASTING_VERSION`); it drops the node's other messages. A new section of a mark needs no higher version, because
+servers skip unknown ones."""
 
 MAX_FRAME_SAMPLES: Final = 19_200
 """Most samples of a frame: twice the 9 600 samples of 50 ms at 192 kHz."""
@@ -89,16 +93,17 @@ WireMessage = Frame | Mark | Hello | Ack | Bye | Request | Welcome
 _JSON_KINDS: Final[dict[int, type[JsonMessage]]] = {3: Hello, 4: Ack, 5: Bye, 6: Request, 7: Welcome}
 _FRAME_KIND: Final = 1
 _MARK_KIND: Final = 2
+_HELLO_KIND: Final = 3
 
 
-def encode(message: WireMessage) -> bytes:
-    """Return a message as bytes."""
+def encode(message: WireMessage, version: int = VERSION) -> bytes:
+    """Return a message as bytes; another `version` is for the acknowledgement that refuses a node of that version."""
     if isinstance(message, Frame):
         return _encode_frame(message)
     if isinstance(message, Mark):
         return _encode_mark(message)
     kind = next(number for number, type_ in _JSON_KINDS.items() if isinstance(message, type_))
-    return _head(kind) + encode_json(message)
+    return _head(kind, version) + encode_json(message)
 
 
 def decode(data: bytes) -> WireMessage:
@@ -107,7 +112,8 @@ def decode(data: bytes) -> WireMessage:
     Raises
     ------
     WireError
-        If they are not a whole, valid message of this version; no other exception is ever raised.
+        If they are not a whole, valid message of this version, `OtherVersionError` if they are of another version; no
+        other exception is ever raised.
     """
     if len(data) > MAX_MESSAGE_BYTES:
         raise WireError(f"message of {len(data)} bytes: expected at most {MAX_MESSAGE_BYTES}")
@@ -117,7 +123,7 @@ def decode(data: bytes) -> WireMessage:
     if magic != _MAGIC:
         raise WireError(f"expected a message of livessl beginning with {_MAGIC!r}, got {magic!r}")
     if version != VERSION:
-        raise WireError(f"expected wire version {VERSION}, got {version}; run the same livessl on nodes and server")
+        raise OtherVersionError(VERSION, version, data[_HEAD.size :] if kind == _HELLO_KIND else None)
     body = memoryview(data)[_HEAD.size :]
     if kind == _FRAME_KIND:
         return _decode_frame(body)
@@ -138,8 +144,8 @@ def sent_ns(data: bytes) -> int:
     return int(_SENT.unpack_from(data, _SENT_AT)[0])
 
 
-def _head(kind: int) -> bytes:
-    return _HEAD.pack(_MAGIC, VERSION, kind, 0)
+def _head(kind: int, version: int = VERSION) -> bytes:
+    return _HEAD.pack(_MAGIC, version, kind, 0)
 
 
 def _encode_frame(frame: Frame) -> bytes:

@@ -23,6 +23,11 @@ MAX_FRAME_INDEX: Final = (2**63 - 1) // FRAME_NS - 1
 MAX_JSON_BYTES: Final = 64 * 1024
 """Longest JSON body, in bytes. Greetings and acknowledgements have a few hundred bytes."""
 
+FIRST_LASTING_VERSION: Final = 2
+"""First version whose header, acknowledgement, and `node`, `run_id` and `arrays` of a greeting stay as they are in all
+later versions, so that a server can inform a node of another version that it is refused. A node of version 1 gets the
+refusal in the server's version, and logs that the versions differ."""
+
 MAX_EXTENSIONS: Final = 64
 """Largest number of extensions that a server may list."""
 
@@ -32,6 +37,39 @@ SECTIONS: Final = "mark-sections"
 
 class WireError(ValueError):
     """Bytes that are not a valid message. The text says what was expected, and what was received."""
+
+
+class OtherVersionError(WireError):
+    """A message of another version of the format.
+
+    Parameters
+    ----------
+    expected, version : int
+        Version of this side, and of the message.
+    greeting : bytes or None
+        Body of the message if it is a greeting.
+
+    Attributes
+    ----------
+    node, run_id : str
+        Names in the greeting; "?" where it cannot be read.
+    arrays : tuple of str
+        Arrays in the greeting; empty where it cannot be read.
+    """
+
+    def __init__(self, expected: int, version: int, greeting: bytes | None) -> None:
+        super().__init__(f"expected wire version {expected}, got {version}; run the same livessl on nodes and server")
+        self.version = version
+        self.reply_version = version if version >= FIRST_LASTING_VERSION else expected
+        self.is_greeting = greeting is not None
+        try:
+            fields = json.loads(greeting) if greeting is not None and len(greeting) <= MAX_JSON_BYTES else None
+        except (ValueError, RecursionError):
+            fields = None
+        known = fields if isinstance(fields, dict) else {}
+        self.node, self.run_id = (known[key] if _is_name(known.get(key)) else "?" for key in ("node", "run_id"))
+        arrays = known.get("arrays")
+        self.arrays = tuple(filter(_is_name, arrays)) if isinstance(arrays, dict) else ()
 
 
 @dataclass(frozen=True, slots=True)

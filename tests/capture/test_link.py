@@ -356,3 +356,15 @@ def test_a_server_that_refuses_is_not_said_to_be_away(caplog: pytest.LogCaptureF
         link.close(bye=False)
     assert "another node has this name" in caplog.text
     assert "no server answers" not in caplog.text
+
+
+def test_invalid_message_of_a_server_is_logged_once(caplog: pytest.LogCaptureFixture) -> None:
+    newer = wire.encode(wire.Ack("run-1", {}), wire.VERSION + 1)
+    with Router() as router, linked(router.endpoint) as link:
+        connect(link, router)
+        for _ in range(3):
+            router.send(newer)
+        router.ack(north=1)
+        link.send([frame(1)])
+        together(link, router, lambda: link.pending == 0, "the acknowledgement")
+    assert caplog.text.count("sent an invalid message: expected wire version") == 1

@@ -126,6 +126,16 @@ def test_disabled_state_hides_the_other_one_and_names_it() -> None:
     assert desk.array("north")["state"] == "healthy"
 
 
+def test_silent_array_of_a_refused_node_has_the_refusal_as_its_reason() -> None:
+    desk = Desk()
+    newer = bytearray(wire.encode(HELLO))
+    newer[4] = wire.VERSION + 1
+    desk.ingest.receive(b"p1", bytes(newer), desk.clock.monotonic_ns())
+    north = desk.array("north")
+    assert north["state"] == "starting"
+    assert north["reason"].startswith("its node 'lab-pc' is refused: the node runs a newer livessl than the server")
+
+
 def test_array_stays_enabled_if_the_store_cannot_remember_otherwise() -> None:
     desk = Desk(ReadOnlyStore())
     with pytest.raises(StoreError):

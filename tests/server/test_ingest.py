@@ -9,7 +9,8 @@ import pytest
 
 from livessl import wire
 from livessl.core.types import BackfillRequest
-from livessl.server.ingest import ACK_NS, GONE_NS, NOTICE_NS, Ingest, Received
+from livessl.server.admission import OTHER_VERSION
+from livessl.server.ingest import ACK_NS, GONE_NS, NOTICE_NS, REFUSED_NS, Ingest, Received
 from livessl.wire import Ack, Bye, Hello, Request, Welcome
 from small_site import frame, mark, site_of
 
@@ -195,6 +196,51 @@ def test_malformed_message_is_counted_and_changes_nothing(data: bytes) -> None:
     assert into.receive(b"p1", data, NOW) == Received()
     assert into.malformed == 1
     assert tell(into, frame(1)).message is not None
+
+
+def of_version(version: int, message: wire.WireMessage) -> bytes:
+    data = wire.encode(message)
+    return data[:4] + bytes([version]) + data[5:]
+
+
+@pytest.mark.parametrize(("version", "which"), [(3, "a newer"), (1, "an older")])
+def test_node_of_another_version_is_refused_in_words_that_it_can_read(version: int, which: str) -> None:
+    into = ingest()
+    received = into.receive(b"p1", of_version(version, HELLO), NOW)
+    assert received.reply is not None
+    assert received.reply.run_id == HELLO.run_id
+    assert f"the node runs {which} livessl than the server (wire version {version}" in str(received.reply.refused)
+    assert received.reply_version == max(version, wire.VERSION)  # version 1 had another header
+    assert received.refused is not None
+    assert (received.refused.node, received.refused.cause) == ("lab-pc", OTHER_VERSION)
+    assert into.malformed == 0
+
+
+def test_other_messages_of_another_version_are_malformed() -> None:
+    into = joined()
+    assert into.receive(b"p1", of_version(3, frame()), NOW) == Received()
+    assert into.malformed == 1
+
+
+@pytest.mark.parametrize("body", [b"", b"[1]", b'{"node": 7, "run_id": null, "arrays": [2]}', b"\xff"])
+def test_greeting_of_another_version_that_cannot_be_read_is_refused_as_well(body: bytes) -> None:
+    received = ingest().receive(b"p1", of_version(3, HELLO)[:14] + body, NOW)
+    assert received.refused is not None
+    assert (received.refused.node, received.refused.arrays) == ("?", ())
+
+
+def test_silent_array_has_the_refusal_of_its_node_as_its_problem() -> None:
+    into = ingest()
+    into.receive(b"p1", of_version(3, HELLO), NOW)
+    assert "its node 'lab-pc' is refused: the node runs a newer livessl" in str(into.problem_of("north"))
+    assert into.problem_of("west") is None
+    into.acknowledgements(NOW + REFUSED_NS)
+    assert into.problem_of("north") is None  # the node greets no more
+    into.receive(b"p1", of_version(3, HELLO), NOW)
+    assert tell(into, HELLO).joined is not None
+    assert into.problem_of("north") is None
+    assert refusal(into, replace(HELLO, run_id="run-2"))
+    assert into.problem_of("north") is None  # the connected node sends the array
 
 
 def test_malformed_messages_are_logged_once_a_minute(caplog: pytest.LogCaptureFixture) -> None:

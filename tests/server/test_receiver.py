@@ -10,9 +10,11 @@ import pytest
 import zmq
 
 from livessl import wire
+from livessl.capture.dealer import Dealer
 from livessl.capture.link import Link
 from livessl.clock import SystemClock
 from livessl.core.types import Frame
+from livessl.server.admission import OTHER_SITE, OTHER_VERSION
 from livessl.server.inlet import QUEUE_MESSAGES
 from livessl.server.receiver import BindError, Joined, Left, Receiver
 from small_site import frame, mark, site_of, wait_until
@@ -80,6 +82,47 @@ def test_malformed_messages_hinder_no_other_node() -> None:
             assert_works(receiver, link, 10 * turn + 1)
         wait_until(lambda: receiver.ingest.malformed >= 0.9 * sent, "the count of what was refused")
         assert receiver.failure is None
+
+
+def test_refused_greetings_are_counted_by_their_cause() -> None:
+    newer = bytearray(wire.encode(HELLO))
+    newer[4] = wire.VERSION + 1
+    unknown = wire.Hello("lab-pc", "run-2", {"cellar": 16000.0})
+    with receiving() as receiver, stranger(receiver) as socket:
+        for data in (bytes(newer), bytes(newer), wire.encode(unknown)):
+            socket.send(data)
+        assert socket.poll(5000), "there is no reply"
+        assert socket.recv()[4] == wire.VERSION + 1
+        wait_until(lambda: receiver.refusals.count("nodes") == 3, "the count of refusals")
+        assert receiver.refusals.counts() == {("nodes", OTHER_VERSION): 2, ("nodes", OTHER_SITE): 1}
+        assert {refused.who for refused in receiver.refusals.known()} == {"node 'lab-pc'"}
+
+
+class NewerDealer(Dealer):
+    """The connection of a node that has the next version of the format, with the same greeting and acknowledgement."""
+
+    def send(self, data: bytes) -> bool:
+        return super().send(data[:4] + bytes([wire.VERSION + 1]) + data[5:])
+
+    def receive(self) -> bytes | None:
+        data = super().receive()
+        if data is not None:
+            assert data[4] == wire.VERSION + 1
+            data = data[:4] + bytes([wire.VERSION]) + data[5:]
+        return data
+
+
+def test_node_of_another_version_learns_why_it_is_refused(caplog: pytest.LogCaptureFixture) -> None:
+    with receiving() as receiver:
+        link = Link(receiver.endpoint, HELLO, CLOCK, dealer=NewerDealer(receiver.endpoint))
+        try:
+            link.wait_connected(lambda: False)
+        finally:
+            link.close(bye=False)
+        assert "the node runs a newer livessl than the server" in str(link.refused)
+        assert "its node 'lab-pc' is refused" in str(receiver.ingest.problem_of("north"))
+    assert "refuses this node: the node runs a newer livessl" in caplog.text
+    assert "nodes: node 'lab-pc' was refused: the node runs a newer livessl" in caplog.text
 
 
 def test_oversized_message_disconnects_only_its_sender() -> None:

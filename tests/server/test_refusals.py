@@ -28,6 +28,13 @@ def test_each_refusal_is_counted_and_logged_once(caplog: pytest.LogCaptureFixtur
     assert max(refusals.known(), key=lambda refused: refused.count).count == 3
 
 
+def test_log_has_the_full_reason_and_the_count_its_cause(caplog: pytest.LogCaptureFixture) -> None:
+    refusals = Refusals(SystemClock())
+    refusals.note("nodes", "node 'pi'", "other version", "the node is older; install the same version")
+    assert refusals.counts() == {("nodes", "other version"): 1}
+    assert "node 'pi' was refused: the node is older; install the same version (logged once" in caplog.text
+
+
 def test_many_addresses_cost_bounded_memory_and_log_lines(caplog: pytest.LogCaptureFixture) -> None:
     refusals = Refusals(SystemClock())
     with caplog.at_level(logging.WARNING):

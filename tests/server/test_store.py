@@ -169,7 +169,7 @@ def test_cursor_is_read_back_from_its_text(cursor: Cursor) -> None:
 
 @pytest.mark.parametrize("text", ["", "7", "7-", "-7", "a-b", "7-7 ", "٧-٧", f"{2**63}-1", f"1-{10**30}"])
 def test_text_that_is_no_cursor_is_an_error(text: str) -> None:
-    with pytest.raises(ValueError, match="expected the next_cursor of the page before"):
+    with pytest.raises(ValueError, match="expected a cursor of a page"):
         Cursor.parse(text)
 
 

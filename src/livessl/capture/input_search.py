@@ -1,6 +1,7 @@
-"""Lists audio inputs, or searches for one, in a process of its own, because a sound library may hang while it does so.
+"""Starts a process that lists audio inputs or searches for one, because a sound library may hang while it does so.
 
-Each search also starts the library anew: only then does it list devices that were connected since.
+`portaudio.py` decides which input a name, serial number or USB port means. Each search starts the library anew, because
+only then does the library list devices that were connected since.
 """
 
 from __future__ import annotations

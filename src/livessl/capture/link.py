@@ -91,6 +91,7 @@ class Link:
         self._warned = False  # that no server has ever answered
         self._hello_due = False
         self._refused: str | None = None
+        self._invalid: str | None = None  # what was wrong with the last invalid message; it is logged once
 
     @property
     def connected(self) -> bool:
@@ -177,7 +178,8 @@ class Link:
             hint = " Check also that this node's key is enrolled there, and that server.public is the server's key."
             _log.warning(
                 "no server answers at %s; buffering and retrying. Check that `livessl serve` runs there, and that the "
-                "port is that of server.bind, not of the dashboard.%s",
+                "port is that of server.bind, not of the dashboard. A server of another version of livessl may not "
+                "answer either; its log says so.%s",
                 self.endpoint,
                 hint if self._keyed else "",
             )
@@ -189,7 +191,9 @@ class Link:
             try:
                 message = wire.decode(data)
             except wire.WireError as error:
-                _log.warning("the server at %s sent an invalid message: %s", self.endpoint, error)
+                if str(error) != self._invalid:
+                    _log.warning("the server at %s sent an invalid message: %s", self.endpoint, error)
+                self._invalid = str(error)
                 continue
             if isinstance(message, wire.Ack):
                 self._acknowledge(message)

@@ -288,7 +288,7 @@ class RefusedCaller(Model):
     """A caller that was refused, and how often for the same reason."""
 
     door: Door
-    who: str = Field(description="Its address, as far as it is known.", examples=["192.0.2.7"])
+    who: str = Field(description="Its address, as far as it is known, or the name of the node.", examples=["192.0.2.7"])
     reason: str = Field(description="Why it was refused.", examples=["its key is not enrolled"])
     count: int = Field(ge=1, description="How often.", examples=[3])
     last_utc: UtcTime = Field(description="When it was refused last.")

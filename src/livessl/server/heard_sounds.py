@@ -50,7 +50,7 @@ class HeardSounds:
         self._sounds: deque[HeardSound] = deque(maxlen=KEPT)
         self._last = first
         self._observed = first  # number of the last sound whose delays were measured
-        self._run = 0  # number of times that all sounds were forgotten
+        self._generation = 0  # increased when all sounds are forgotten
 
     @property
     def last(self) -> int:
@@ -68,14 +68,14 @@ class HeardSounds:
         with self._lock:
             self._new.clear()
             self._sounds.clear()
-            self._run += 1
+            self._generation += 1
 
     def after(self, number: int) -> list[HeardSound]:
         """Return the sounds with a higher number, the oldest first."""
         return self.read(number)[0]
 
     def read(self, number: int) -> tuple[list[HeardSound], int]:
-        """Return the sounds with a higher number, the oldest first, and the number for the next request."""
+        """Return the sounds with a higher number, the oldest first, and the `number` for the next request."""
         self._observe()
         with self._lock:
             return [sound for sound in self._sounds if sound.number > number], self._observed
@@ -98,7 +98,7 @@ class HeardSounds:
         """Measure the delays of new sounds."""
         with self._observing:
             with self._lock:
-                new, run, last = list(self._new), self._run, self._last
+                new, generation, last = list(self._new), self._generation, self._last
                 self._new.clear()
                 if not new:
                     self._observed = last
@@ -108,5 +108,5 @@ class HeardSounds:
             ]
             with self._lock:
                 self._observed = last
-                if run == self._run:
+                if generation == self._generation:  # otherwise they were forgotten meanwhile
                     self._sounds.extend(observed)

@@ -1,4 +1,7 @@
-"""The server's side of the link to the nodes: greetings, sequence numbers, acknowledgements. It owns no socket."""
+"""The server's side of the link to the nodes: greetings, sequence numbers, acknowledgements. It owns no socket.
+
+`admission` decides which greetings are refused.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +12,7 @@ from typing import Final
 
 from livessl import wire
 from livessl.core.types import BackfillRequest, Frame, Mark, Message
+from livessl.server.admission import Refusal, refusal_of, refusal_of_version
 from livessl.server.node_clocks import NodeClocks
 from livessl.server.node_reports import NodeReports
 from livessl.site.models import Site
@@ -22,6 +26,10 @@ limited number of frames that are not acknowledged."""
 
 GONE_NS: Final = 2_000_000_000
 """Silence, in nanoseconds, after which another node may take a node's name and arrays."""
+
+REFUSED_NS: Final = 5_000_000_000
+"""Time, in nanoseconds, for which the reason of a refusal explains why an array is silent. A refused node greets again
+every second."""
 
 NODE_ALIVE_NS: Final = 1_400_000_000
 """Silence, in nanoseconds, after which a node counts as dead: longer than the second between two greetings, shorter
@@ -69,8 +77,9 @@ class Peer:
 class Received:
     """The result of one message.
 
-    `joined` is set by a new run, `greeted` by a known run whose backlog changed. `welcome` lists the
-    extensions that the server reads, and `offer` announces requests for frames. Both are sent before the reply.
+    `joined` is set by a new run, `greeted` by a known run whose backlog changed. `welcome` lists the extensions that
+    the server reads, and `offer` announces requests for frames. Both are sent before the reply. `refused` is set by a
+    refused greeting; the reply then contains the reason, in the version of the format that the node reads.
     """
 
     message: Message | None = None
@@ -80,6 +89,8 @@ class Received:
     reply: wire.Ack | None = None
     offer: wire.Request | None = None
     welcome: wire.Welcome | None = None
+    refused: Refusal | None = None
+    reply_version: int = wire.VERSION
 
 
 class Ingest:
@@ -95,6 +106,7 @@ class Ingest:
         self._site = site
         self._peers: dict[bytes, Peer] = {}
         self._final_until: Mapping[str, int] = {}  # replaced as a whole, never changed, so that readers need no lock
+        self._refused: dict[str, tuple[str, int]] = {}  # by array: why its node was refused, and when
         self._notice_ns = -NOTICE_NS
         self.node_clocks = NodeClocks()
         self.node_reports = NodeReports()
@@ -125,7 +137,9 @@ class Ingest:
         self._kept = arrays
 
     def problem_of(self, array: str) -> str | None:
-        """Return the problem that an array's node reports about its device; None without a problem."""
+        """Return why an array's node is refused, or the problem that it reports about its device; None without one."""
+        if (refused := self._refused.get(array)) is not None:
+            return refused[0]
         return next((p.hello.problem for p in self._peers.values() if array in p.hello.arrays and not p.ended), None)
 
     def is_live(self, array: str, now_ns: int) -> bool:
@@ -139,6 +153,13 @@ class Ingest:
         """Take in one message from one peer; `enrolled` is the node that owns the peer's key, if the site uses keys."""
         try:
             message = wire.decode(data)
+        except wire.OtherVersionError as error:
+            if not error.is_greeting:
+                return self._reject(error, now_ns)
+            refused = refusal_of_version(error)
+            self._note_refusal(refused, now_ns)
+            reply = wire.Ack(error.run_id, {}, refused=refused.text)
+            return Received(reply=reply, refused=refused, reply_version=error.reply_version)
         except wire.WireError as error:
             return self._reject(error, now_ns)
         if isinstance(message, wire.Hello):
@@ -216,6 +237,8 @@ class Ingest:
         self._peers = {
             key: peer for key, peer in self._peers.items() if now_ns - peer.last_ns < 30 * GONE_NS and not peer.ended
         }
+        if self._refused:
+            self._refused = {array: why for array, why in self._refused.items() if now_ns - why[1] < REFUSED_NS}
         due = []
         for peer in self._peers.values():
             waits = peer.hello.replay or (soon and peer.hello.backlog)
@@ -240,9 +263,19 @@ class Ingest:
         return [p.hello for p in self._peers.values() if not p.ended and now_ns - p.last_ns < GONE_NS]
 
     def _greet(self, routing_id: bytes, hello: wire.Hello, now_ns: int, enrolled: str | None) -> Received:
-        refusal = self._key_fault(hello, enrolled) or self._refusal(routing_id, hello, now_ns)
-        if refusal is not None:
-            return Received(reply=wire.Ack(hello.run_id, {}, refused=refusal))
+        live = [
+            peer.hello
+            for key, peer in self._peers.items()
+            if key != routing_id
+            and not peer.ended
+            and peer.hello.run_id != hello.run_id
+            and now_ns - peer.last_ns < GONE_NS
+        ]
+        refused = refusal_of(self._site, hello, enrolled, live)
+        if refused is not None:
+            self._note_refusal(refused, now_ns)
+            return Received(reply=wire.Ack(hello.run_id, {}, refused=refused.text), refused=refused)
+        self._refused = {array: why for array, why in self._refused.items() if array not in hello.arrays}
         same_run = next((p for p in self._peers.values() if p.hello.run_id == hello.run_id), None)
         known = self._peers.get(routing_id)
         unaware = not hello.answers and (known is None or known.hello.answers)
@@ -273,52 +306,12 @@ class Ingest:
         final = [self._final_until[array] for array in peer.hello.arrays if array in self._final_until]
         return wire.Ack(peer.hello.run_id, dict(peer.received), min(final, default=None))
 
-    def _key_fault(self, hello: wire.Hello, enrolled: str | None) -> str | None:
-        """Return the reason why the node may not use this key, which belongs to one node; None if it may."""
-        if enrolled is None:
-            return None
-        if hello.node != enrolled:
-            return f"node {hello.node!r} has shown the key of {enrolled!r}; give each node its own"
-        foreign = next((a for a in hello.arrays if self._site.node_of(a) not in (None, enrolled)), None)
-        if foreign is not None and not hello.replay:
-            return f"array {foreign!r} belongs to node {self._site.node_of(foreign)!r} in the server's site file"
-        return None
-
-    def _refusal(self, routing_id: bytes, hello: wire.Hello, now_ns: int) -> str | None:
-        known = [spec.name for spec in self._site.processed]
-        unknown = next((name for name in hello.arrays if name not in known), None)
-        if unknown is not None:
-            joint = next((name for name, members in self._site.joint.items() if unknown in members), None)
-            if joint is not None:
-                return f"array {unknown!r} is joined in {joint!r} at the server; give node and server the same `joint`"
-            return f"no array {unknown!r} in the server's site file; it has {', '.join(known)}"
-        for name, rate_hz in hello.arrays.items():
-            node = self._site.node_of(name)
-            stated_hz = self._site.nodes[node].device.sample_rate_hz if node else None
-            if stated_hz is not None and rate_hz != stated_hz:
-                where = f"nodes.{node}.device.sample_rate_hz"
-                return f"array {name!r}: the server's site file says {stated_hz:g} Hz ({where}), got {rate_hz:g} Hz"
-            high_hz = self._site.array(name).band_hz[1]
-            if high_hz >= rate_hz / 2:
-                needed = f"array {name!r} uses up to {high_hz:g} Hz and needs more than {2 * high_hz:g} Hz"
-                return f"{needed}, got {rate_hz:g} Hz; correct the node's sample_rate_hz"
-        others = [
-            peer
-            for key, peer in self._peers.items()
-            if key != routing_id
-            and not peer.ended
-            and peer.hello.run_id != hello.run_id
-            and now_ns - peer.last_ns < GONE_NS
-        ]
-        for other in others:
-            if other.hello.replay != hello.replay:
-                return "live nodes are connected; stop them first" if hello.replay else "a replay is running"
-            if other.hello.node == hello.node:
-                return f"a node named {hello.node!r} is connected already; names must differ"
-            taken = sorted(set(other.hello.arrays) & set(hello.arrays))
-            if taken:
-                return f"array {taken[0]!r} is captured by node {other.hello.node!r} already"
-        return None
+    def _note_refusal(self, refused: Refusal, now_ns: int) -> None:
+        """Remember for a while why the arrays of a refused node send nothing, unless another node sends them."""
+        sent = {array for hello in self.live_nodes(now_ns) for array in hello.arrays}
+        why = f"its node {refused.node!r} is refused: {refused.text}"
+        known = [spec.name for spec in self._site.processed if spec.name in refused.arrays and spec.name not in sent]
+        self._refused = {**self._refused, **dict.fromkeys(known, (why, now_ns))}
 
     def _reject(self, error: wire.WireError, now_ns: int) -> Received:
         self.malformed += 1

@@ -19,7 +19,7 @@ from livessl import wire
 from livessl.clock import Clock
 from livessl.core.types import BackfillRequest, Frame, Message
 from livessl.errors import RunError
-from livessl.server.guard import guard
+from livessl.server.guard import DOOR, guard
 from livessl.server.ingest import Ingest
 from livessl.server.inlet import Inlet
 from livessl.server.latency import Arrival, Arrivals
@@ -264,6 +264,9 @@ class Receiver:
             read.append((0, Greeted(received.greeted)))
         if received.left is not None:
             read.append((0, Left(received.left)))
+        if received.refused is not None:
+            refused = received.refused
+            self.refusals.note(DOOR, f"node {refused.node!r}", refused.cause, refused.text)
         message = received.message
         if message is not None:
             arrival = Arrival(wire.sent_ns(data), self._clock.now_ns())
@@ -274,7 +277,7 @@ class Receiver:
             if announcement is not None:
                 self._reply(routing_id, announcement)
         if received.reply is not None:
-            self._reply(routing_id, received.reply)
+            self._reply(routing_id, received.reply, received.reply_version)
 
     def _put(self, items: Sequence[tuple[int, Item]]) -> None:
         while items and not self._stop.is_set():
@@ -292,8 +295,10 @@ class Receiver:
         for routing_id, request in self.ingest.requests(due):
             self._reply(routing_id, request)
 
-    def _reply(self, routing_id: bytes, reply: wire.Ack | wire.Request | wire.Welcome) -> None:
+    def _reply(
+        self, routing_id: bytes, reply: wire.Ack | wire.Request | wire.Welcome, version: int = wire.VERSION
+    ) -> None:
         try:
-            self._socket.send_multipart([routing_id, wire.encode(reply)], zmq.NOBLOCK)
+            self._socket.send_multipart([routing_id, wire.encode(reply, version)], zmq.NOBLOCK)
         except zmq.ZMQError as error:  # the node is gone or does not read; it will greet again
             _log.debug("no reply to %r: %s", routing_id, error)

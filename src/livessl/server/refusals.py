@@ -1,4 +1,9 @@
-"""Refused nodes and clients: all are counted, and a bounded number is remembered and logged."""
+"""Refused nodes and clients: all are counted by their cause, and a bounded number is remembered and logged.
+
+Counted are handshakes that `guard` refuses, greetings that `admission` refuses (those of another version among them),
+and requests that `api/auth` and `api/hosts` refuse. Messages that are no valid ones are not refusals of a node:
+`Ingest.malformed` counts them.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +15,7 @@ from typing import Final
 from livessl.clock import Clock
 
 MAX_KNOWN: Final = 256
-"""Most callers remembered by address and reason; the refusals of any further ones are only counted."""
+"""Most callers remembered by address or name, and reason; the refusals of any further ones are only counted."""
 
 _log = logging.getLogger(__name__)
 
@@ -19,7 +24,8 @@ _log = logging.getLogger(__name__)
 class Refused:
     """The refusals of one caller for one reason.
 
-    `door` is the interface, `nodes` or `http`; `who` the caller's address, `last_ns` the site time of the last refusal.
+    `door` is the interface, `nodes` or `http`; `who` is the caller's address, or the name of a node that greeted;
+    `last_ns` is the site time of the last refusal.
     """
 
     door: str
@@ -43,10 +49,10 @@ class Refusals:
         self._counts: dict[tuple[str, str], int] = {}
         self._known: dict[tuple[str, str, str], Refused] = {}
 
-    def note(self, door: str, who: str, reason: str) -> None:
+    def note(self, door: str, who: str, reason: str, text: str | None = None) -> None:
         """Count a refusal; only the first one of a caller for a reason is logged.
 
-        `reason` is one of a few fixed texts, because it labels a metric.
+        `reason` is one of a few fixed texts, because it labels a metric. The log has `text`, if there is one, instead.
         """
         with self._lock:
             self._counts[door, reason] = self._counts.get((door, reason), 0) + 1
@@ -57,7 +63,7 @@ class Refusals:
             count = 1 if before is None else before.count + 1
             self._known[key] = Refused(door, who, reason, count, self._clock.now_ns())
         if before is None:
-            _log.warning("%s: %s was refused: %s (logged once, counted in /metrics)", door, who, reason)
+            _log.warning("%s: %s was refused: %s (logged once, counted in /metrics)", door, who, text or reason)
 
     def counts(self) -> dict[tuple[str, str], int]:
         """Return the number of refusals by door and reason."""

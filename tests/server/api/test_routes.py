@@ -332,10 +332,10 @@ def test_events_of_a_zone_and_confidence(client: httpx.Client) -> None:
         ({"array": "west"}, 404, "no array 'west'; there are north, south"),
         ({"min_level_dbfs": "loud"}, 422, "valid number"),
         ({"text": ""}, 422, "at least 1 character"),
-        ({"after": "rubbish"}, 422, "after: expected the next_cursor"),
+        ({"after": "rubbish"}, 422, "after: expected the previous_cursor of a page, got 'rubbish'"),
         ({"after": "1-1", "cursor": "1-1"}, 422, "expected cursor or after, got both"),
-        ({"cursor": "rubbish"}, 422, "cursor: expected the next_cursor of the page before, got 'rubbish'"),
-        ({"cursor": 10**30}, 422, "cursor: expected the next_cursor of the page before"),
+        ({"cursor": "rubbish"}, 422, "cursor: expected the next_cursor of a page, got 'rubbish'"),
+        ({"cursor": 10**30}, 422, "cursor: expected the next_cursor of a page"),
     ],
 )
 def test_wrong_query_is_refused(client: httpx.Client, query: dict[str, Any], status: int, detail: str) -> None:

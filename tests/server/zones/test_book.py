@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from livessl.server.zones.book import ZoneBook, ZoneRefusedError, ZonesFileError
-from livessl.server.zones.zone_map import ZoneMap
+from livessl.server.zones.zone_map import ZoneMap, no_zone
 from livessl.site import zones_file
 from livessl.site.zone_models import Zone
 from small_site import Changes, site_of
@@ -155,3 +155,8 @@ def test_membership_says_how_probable_each_zone_is_and_what_excludes() -> None:
     assert shapes.excluding(shapes.holding(position), found) == []
     assert shapes.excluding(["fan"], {}) == ["fan"]
     assert shapes.excluding([], {"fan": 0.5}) == ["fan"]
+
+
+def test_unknown_zone_is_answered_with_the_names_of_all_zones() -> None:
+    assert no_zone("hall", ["door", "desk"]) == "no zone 'hall'; zones are door, desk"
+    assert no_zone("hall", []) == "no zone 'hall'; this site has no zones"

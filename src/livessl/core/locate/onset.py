@@ -1,4 +1,8 @@
-"""The default method `onset`: SRP of onset GCCs, without outliers, with a second source and a probability."""
+"""The default method `onset`: SRP of onset GCCs, without outliers, with a second source and a probability.
+
+`srp.py` sums the maps of the arrays, each with the weight 2/K. `contributing.py` decides which arrays contribute, and
+`outliers.py` which are excluded.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Finds peaks in power maps, refines them between grid points, and computes their covariance and margin."""
+"""Finds peaks in power maps, refines them between grid points, and computes their covariance and margin.
+
+`confidence.py` scales the covariance of the method `onset`, and `set_up_error.py` adds the error of the set-up.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Makes results from localizations: status, reason, and the contribution of each array. It keeps no state.
+"""Makes results from localizations: id, status, reason, and the contribution of each array. It keeps no state.
 
 `locate/confidence.py` decides whether a position is refused because of its confidence.
 """
@@ -271,6 +271,10 @@ class Verdicts:
         )
 
     def _id(self, frame_index: int) -> str:
+        """Return the id of an event that begins at a frame index: site and start, in milliseconds since the epoch.
+
+        It is the same in every result of the event, after a restart, and in a replay at the same times.
+        """
         return f"{self._state.site}-{frame_index * FRAME_NS // 1_000_000}"
 
 

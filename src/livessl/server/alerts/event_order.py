@@ -88,16 +88,16 @@ class EventOrder:
         live_ns, live_until_ns = (final_ns, 0) if self._live_ns is None else self._live_ns
         if judged_ns is not None and (before_ns := min(final_ns, live_ns)) > judged_ns:
             for page, until_ns in past_pages(self._store, judged_ns, before_ns):
-                self._announce(in_force.judge.judge_events(page, until_ns))
+                self._announce(in_force.runner.judge_events(page, until_ns))
         done_ns = max(final_ns if judged_ns is None else judged_ns, live_until_ns)
         if judged_ns is None or done_ns > judged_ns:
-            in_force.judge.skip(done_ns)
+            in_force.runner.skip(done_ns)
 
     def _judge_batch(self, in_force: AlertsInForce, batch: Batch) -> None:
         """Judge events that came; while the past waits, the time before which all are judged stays where it is."""
         until_ns = batch.until_ns if self._is_caught_up else None
         began_ns = 0 if self._traces is None else self._clock.now_ns()
-        alerts = in_force.judge.judge_events(batch.events, until_ns, early=batch.until_ns is None)
+        alerts = in_force.runner.judge_events(batch.events, until_ns, early=batch.until_ns is None)
         if self._traces is not None:
             for alert in alerts:
                 self._traces.alerted(alert, began_ns, self._clock.now_ns())

@@ -13,9 +13,9 @@ from livessl.server.alerts.actions import ActionSetting, make_action
 from livessl.server.alerts.delivery import Deliverer
 from livessl.server.alerts.evidence import Evidence
 from livessl.server.alerts.history import DryRuns
-from livessl.server.alerts.judge import Judge
 from livessl.server.alerts.message import AlertMessages, with_links
 from livessl.server.alerts.outbox import Outbox
+from livessl.server.alerts.rule_runner import RuleRunner
 from livessl.server.event_traces import EventTraces
 from livessl.server.signed_links import SignedLinks
 from livessl.server.store import Store
@@ -88,7 +88,7 @@ class AlertsInForce:
         """The deliverer of each action, by name."""
         self.dry_runs = DryRuns(self.config, around.store, around.zones)
         """Tries rules on the history."""
-        self.judge = Judge(site, around.clock, outbox, AlertMessages(site, base), around.zones)
+        self.runner = RuleRunner(site, around.clock, outbox, AlertMessages(site, base), around.zones)
         """The rules with their states."""
         if not self.judges_events:  # rules that come back must not judge the time between
             outbox.forget_judged(site.site)

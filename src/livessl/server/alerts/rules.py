@@ -1,4 +1,8 @@
-"""Rules on events: which events match, and which of those alert. Values in, values out; the dry run uses the same."""
+"""Decides whether a rule alerts: which events match it, its arming, schedule, hold-off and count.
+
+`rule_runner` applies the rules of a running server, and a dry run the same functions to stored events. `schedule`
+says when a rule may alert. `conditions` follows arrays and findings. Values in, values out.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Times of the week at which a rule may alert, by the wall clock of the site's time zone."""
+"""Decides whether the schedule of a rule is open at an instant, by the wall clock of the site's time zone.
+
+`rules` asks it before a rule alerts; the spans are parsed and checked in `site/alert_models.py`.
+"""
 
 from __future__ import annotations
 

@@ -23,9 +23,9 @@ from livessl.server.alerts.event_order import EventOrder
 from livessl.server.alerts.evidence import Evidence
 from livessl.server.alerts.history import DryRuns
 from livessl.server.alerts.in_force import AlertsInForce, Surroundings, outbox_path
-from livessl.server.alerts.judge import Judge
 from livessl.server.alerts.outbox import DeliveryState, Outbox, OutboxError
 from livessl.server.alerts.retention import Retention
+from livessl.server.alerts.rule_runner import RuleRunner
 from livessl.server.alerts.rules import RuleState
 from livessl.server.alerts.thread import AlertThread, TurnTooLongError
 from livessl.server.api.encode import JsonObject
@@ -59,11 +59,11 @@ class Conditions:
     set_up_watch: SetUpWatch
     site_time: SiteTime
 
-    def judge(self, judge: Judge, now_ns: int) -> Sequence[JsonObject]:
+    def judge(self, runner: RuleRunner, now_ns: int) -> Sequence[JsonObject]:
         """Return the alerts that rules raise at a time about the present arrays and findings; none during a replay."""
         if self.site_time.is_replay:
             return ()
-        return judge.judge_conditions(self.array_states.describe(levels=False), self.set_up_watch.state, now_ns)
+        return runner.judge_conditions(self.array_states.describe(levels=False), self.set_up_watch.state, now_ns)
 
 
 class Alerts:
@@ -200,12 +200,12 @@ class Alerts:
     @property
     def states(self) -> dict[str, RuleState]:
         """The state of each rule, by name."""
-        return self._in_force.judge.states
+        return self._in_force.runner.states
 
     def arm(self, rule: str, armed: bool) -> None:
-        """Arm or disarm a rule: see `Judge.arm`."""
+        """Arm or disarm a rule: see `RuleRunner.arm`."""
         with self._changing:
-            self._in_force.judge.arm(rule, armed)
+            self._in_force.runner.arm(rule, armed)
 
     def note_in_journal(self, alert: JsonObject) -> None:
         """Note that the journal has an alert; if that fails, the next start puts it there again, under the same key."""
@@ -282,11 +282,11 @@ class Alerts:
     def _judge(self) -> None:
         self._events.judge_waiting(self._in_force)
         self._events.backlog.work_off_changes(
-            lambda changes: self._announce(self._in_force.judge.judge_changes(changes))
+            lambda changes: self._announce(self._in_force.runner.judge_changes(changes))
         )
         now_ns = self._around.clock.now_ns()
         if self._in_force.judges_conditions:
-            self._announce(self._conditions.judge(self._in_force.judge, now_ns))
+            self._announce(self._conditions.judge(self._in_force.runner, now_ns))
         self._retention.delete_old(self.outbox, now_ns)
 
     def _announce(self, alerts: Sequence[JsonObject]) -> None:

@@ -214,7 +214,8 @@ def _add_dismissal(router: APIRouter, letters: DeadLetters) -> None:
 def _check_rule(parts: Parts, name: str) -> None:
     rules = parts.alerts.config.rules
     if name not in rules:
-        raise HTTPException(404, f"no rule {name!r}; rules are {', '.join(rules) or 'none'}")
+        listed = f"rules are {', '.join(rules)}" if rules else "this site has no rules"
+        raise HTTPException(404, f"no rule {name!r}; {listed}")
 
 
 @contextmanager

@@ -14,6 +14,7 @@ from livessl.server.api.queries import unprocessable
 from livessl.server.history.log import LogPosition
 from livessl.server.parts import Parts
 from livessl.server.store import Query as EventQuery
+from livessl.server.zones.zone_map import no_zone
 
 
 def event_log_route(parts: Parts) -> APIRouter:
@@ -43,7 +44,7 @@ def event_log_route(parts: Parts) -> APIRouter:
         """
         zones = parts.zone_book.current.zones
         if zone is not None and zone not in zones:
-            raise HTTPException(404, f"no zone {zone!r}; zones are {', '.join(zones) or 'none'}")
+            raise HTTPException(404, no_zone(zone, zones))
         try:
             place = None if after is None else LogPosition.parse(after)
         except ValueError as error:

@@ -1,4 +1,4 @@
-"""REST: the history of events, its exports, and a heat map of it."""
+"""HTTP routes of the history of events, of its exports, and of its heat map."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ from livessl.server.history.export import FORMATS
 from livessl.server.history.heat_map import Cells
 from livessl.server.parts import Parts
 from livessl.server.store import Query as EventQuery
+from livessl.server.zones.zone_map import no_zone
 from livessl.site.build.grid import search_grid
 
 MAX_CELLS: Final = 250_000
@@ -33,7 +34,7 @@ _NAMES: Final = errors(404, 503, texts={404: "There is no zone or array of that 
 
 
 def history_routes(parts: Parts) -> APIRouter:
-    """Events, exports and heat map."""
+    """Return the routes of events, exports and heat map."""
     router = APIRouter()
     searched = Depends(_filters(parts))
     _add_events(router, parts, searched)
@@ -43,7 +44,7 @@ def history_routes(parts: Parts) -> APIRouter:
 
 
 def _filters(parts: Parts) -> Callable[..., EventQuery]:
-    """The query parameters that all searches share."""
+    """Return the dependency with the query parameters that all searches share."""
     site = parts.site
 
     def filters(
@@ -65,16 +66,17 @@ def _filters(parts: Parts) -> Callable[..., EventQuery]:
             Query(
                 min_length=1,
                 max_length=200,
-                description="only events with this text in id, status, reason, method, zones or arrays, in any case",
+                description="only events with this text in id, status, reason, method, zones or arrays, ignoring case",
             ),
         ] = None,
         excluded: Annotated[
-            bool | None, Query(description="only events in excluded zones, or only events elsewhere")
+            bool | None,
+            Query(description="`true`: only events in excluded zones; `false`: only events outside of them"),
         ] = None,
     ) -> EventQuery:
         zones = parts.zone_book.current.zones
         if zone is not None and zone not in zones:
-            raise HTTPException(404, f"no zone {zone!r}; zones are {', '.join(zones) or 'none'}")
+            raise HTTPException(404, no_zone(zone, zones))
         known = [*dict.fromkeys([*array_names(site), *(spec.name for spec in site.specs)])]
         if array is not None and array not in known:
             raise HTTPException(404, f"no array {array!r}; there are {', '.join(known)}")
@@ -127,7 +129,7 @@ def _add_exports(router: APIRouter, parts: Parts, searched: Any) -> None:
                 raise HTTPException(501, "Parquet needs the package pyarrow; pip install 'livessl[export]'")
             name = f"{parts.site.site}-events.{form}".encode("ascii", "replace").decode().replace('"', "_")
             headers = {"Content-Disposition": f'attachment; filename="{name}"'}
-            if "head_only" in request.scope:  # nothing of a long stream would be sent
+            if "head_only" in request.scope:  # the stream is not begun, because its body would not be sent
                 return Response(media_type=media_type, headers=headers)
             return StreamingResponse(encode(parts.store.scan(query)), media_type=media_type, headers=headers)
 
@@ -135,7 +137,7 @@ def _add_exports(router: APIRouter, parts: Parts, searched: Any) -> None:
             f"/api/v1/events.{form}",
             tags=["estimates"],
             name=f"export_{form}",
-            description="All events that the filters admit, newest first, as a stream.",
+            description="All events that match the filters, newest first, as a stream.",
             response_class=Response,
             responses={
                 200: {"description": "The events.", "content": {media_type: _BINARY}},
@@ -162,9 +164,9 @@ def _add_heat_map(router: APIRouter, parts: Parts, searched: Any) -> None:
         request: Request,
         query: EventQuery = searched,
         spacing_m: Annotated[float, Query(ge=0.01, le=100, description="edge of a cell in metres")] = 0.25,
-        format: Annotated[Literal["json", "png"], Query(description="numbers, or picture")] = "json",  # noqa: A002
+        format: Annotated[Literal["json", "png"], Query(description="`json`: numbers; `png`: a picture")] = "json",  # noqa: A002
     ) -> Response:
-        """Number of events in each cell of the floor plan; with format=png a picture of it, y upwards."""
+        """Number of events in each cell of the floor plan; with format=png a picture, y upwards."""
         cells = Cells(low_mm, high_mm, round(1000 * spacing_m))
         if cells.shape[0] * cells.shape[1] > MAX_CELLS:
             most = f"{cells.shape[0]} x {cells.shape[1]}"

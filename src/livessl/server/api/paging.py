@@ -1,4 +1,4 @@
-"""Pages of events, and answers that a client may have already: shared by the histories of a server and of a hub."""
+"""Pages of events, and answers with an ETag. The histories of a server and of a hub both use them."""
 
 from __future__ import annotations
 
@@ -17,20 +17,21 @@ from livessl.server.history.query import Query as EventQuery
 UNCHANGED: Final[dict[int | str, dict[str, Any]]] = {
     304: {"description": "Nothing has changed since the answer with the ETag in `If-None-Match`."}
 }
-"""The response of `cached` to a client that has the answer already, for OpenAPI."""
+"""Description for OpenAPI of the 304 with which `cached` answers a client that has the answer already."""
 
 
 def paged(searched: Any) -> Any:
-    """Return the dependency of a route that lists events: what `searched` depends on, and the page of it."""
+    """Return the dependency of a route that lists events: the filters of `searched`, `limit`, `cursor` and `after`."""
 
     def page(
         query: EventQuery = searched,
         limit: Annotated[int, Query(ge=1, le=1000, description="most events on a page")] = 50,
         cursor: Annotated[
-            str | None, Query(description="`next_cursor` of a page, unchanged: the events after its last one")
+            str | None, Query(description="`next_cursor` of a page, unchanged; continues the list: older events")
         ] = None,
         after: Annotated[
-            str | None, Query(description="`previous_cursor` of a page, unchanged: the events before its first one")
+            str | None,
+            Query(description="`previous_cursor` of a page, unchanged; goes back: newer events than those of the page"),
         ] = None,
     ) -> EventQuery:
         if cursor is not None and after is not None:

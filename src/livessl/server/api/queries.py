@@ -19,6 +19,7 @@ from livessl.clock import utc_ns
 from livessl.server.fanout import Filter
 from livessl.server.maps import FUSED, VIEWS
 from livessl.server.store import Cursor
+from livessl.server.zones.zone_map import no_zone
 from livessl.site.models import Site
 
 Time = Annotated[str, WithJsonSchema({"type": "string", "format": "date-time"})]
@@ -181,7 +182,7 @@ def require_no_nul(**texts: str | None) -> None:
 
 
 def page_cursor(text: str | None, name: str = "cursor") -> Cursor | None:
-    """The place in the list of events that a page's `next_cursor` or `previous_cursor` stands for.
+    """Return the place in the list of events for a page's `next_cursor`, or its `previous_cursor` if `name` is `after`.
 
     Raises
     ------
@@ -191,7 +192,8 @@ def page_cursor(text: str | None, name: str = "cursor") -> Cursor | None:
     try:
         return None if text is None else Cursor.parse(text)
     except ValueError as error:
-        raise unprocessable(name, f"{name}: {error}") from error
+        wanted = "previous_cursor" if name == "after" else "next_cursor"
+        raise unprocessable(name, f"{name}: expected the {wanted} of a page, got {text!r}") from error
 
 
 def live_filter(
@@ -219,7 +221,7 @@ def live_filter(
     if rate_hz is not None and not 0.0 < rate_hz <= MAX_RATE_HZ:
         raise ValueError(f"max_rate_hz: expected a number above 0, at most {MAX_RATE_HZ:g}, got {max_rate_hz!r}")
     if zone is not None and zone not in zones:
-        raise ValueError(f"zone: no zone {zone!r}; zones are {', '.join(zones) or 'none'}")
+        raise ValueError(f"zone: {no_zone(zone, zones)}")
     return Filter(chosen, least, zone, whole_number("track", track, "the number of a track"), rate_hz)
 
 

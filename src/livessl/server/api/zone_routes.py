@@ -16,6 +16,7 @@ from livessl.server.api.queries import unprocessable
 from livessl.server.api.routes import as_json
 from livessl.server.parts import Parts
 from livessl.server.zones.book import ZoneRefusedError, ZonesFileError
+from livessl.server.zones.zone_map import no_zone
 from livessl.site.floor_plan import PNG, SVG
 from livessl.site.zone_models import Zone
 
@@ -87,7 +88,7 @@ def _add_zone_changes(router: APIRouter, parts: Parts) -> None:
         changes = [change for change in reversed(tuple(parts.presence.changes)) if zone in (None, change["zone"])]
         zones = parts.zone_book.current.zones
         if zone is not None and zone not in zones and not changes:  # a zone that was deleted keeps its changes
-            raise HTTPException(404, f"no zone {zone!r}; zones are {', '.join(zones) or 'none'}")
+            raise HTTPException(404, no_zone(zone, zones))
         return as_json({"v": API_VERSION, "changes": changes[:limit]})
 
 

@@ -1,4 +1,8 @@
-"""Makes one event's clip in memory, then writes it: each array, and one signal beamed towards the event's position."""
+"""Makes one event's clip in memory, then writes it: each array, and one signal beamed towards the event's position.
+
+Another file format of clips also concerns `recordings/sound_file.py` (reading and writing), `schema/clips.py` (the
+answers' `format`) and `server/api/clip_routes.py` (media types).
+"""
 
 from __future__ import annotations
 

@@ -46,16 +46,18 @@ NICENESS: Final = 10
 """Niceness of the thread that locates again: live sound comes first."""
 
 STRIDE: Final = 40
-"""Number of frame indices that are handed to the fusion at a time, as many as its final pass takes."""
+"""Number of frame indices that are passed to the fusion at a time, as many as the final pass of a server closes."""
 
 SAME_M: Final = 1e-4
-"""Distance, in metres, up to which a microphone counts as being at the same place: positions are stored so exactly."""
+"""Largest distance, in metres, between two positions of a microphone that count as the same: stored positions are
+rounded."""
 
 GiveWay = Callable[[], None]
-"""Is called between two steps of a long computation; raises `BusyError` to end it."""
+"""A function that is called between two steps of a long computation; it raises `BusyError` to end the computation."""
 
 SetUp = Literal["then", "now"]
-"""The poses of the arrays, and the speed of sound: those by which the event was located, or those now in force."""
+"""Poses of the arrays, and speed of sound: with `then`, those with which the event was located; with `now`, those that
+are in force."""
 
 
 class BusyError(RelocationError):
@@ -64,7 +66,7 @@ class BusyError(RelocationError):
 
 @dataclass(frozen=True, slots=True)
 class Relocation:
-    """An event as it is located again.
+    """The result of locating an event again.
 
     Parameters
     ----------
@@ -73,7 +75,7 @@ class Relocation:
     others : tuple of Event
         Further sources that sounded at the same time.
     moved : tuple of str
-        Arrays that are elsewhere, or turned, since the event was located first.
+        Arrays that were moved or turned after the event was located first.
     """
 
     event: Event
@@ -86,18 +88,18 @@ def _go_on() -> None:
 
 
 def digest_of(site: Site, method: str | None, set_up: SetUp) -> str:
-    """Return a digest of everything but the clips that decides the answers.
+    """Return a digest of everything except the clips on which the answers depend.
 
-    These are the release, the method and the set-up, and of the site the processed arrays (poses, bands, accuracy,
-    joints), the speed of sound, the search grid, the activity detection and the fusion. The code of a method that is
-    named by MODULE:NAME is not part of it.
+    The digest covers the release, the method and the set-up, and from the site the processed arrays (poses, bands,
+    accuracy, joints), the speed of sound, the search grid, the activity detection and the fusion. It does not cover
+    the code of a method that is named by MODULE:NAME.
 
     Parameters
     ----------
     site : Site
-        With the poses of now.
+        The site with the poses that are in force.
     method : str or None
-        None takes the one by which each event was located.
+        Method by which all events are located again; None locates each event by its own.
     set_up : "then" or "now"
     """
     decisive = {
@@ -114,7 +116,7 @@ def digest_of(site: Site, method: str | None, set_up: SetUp) -> str:
 def known_methods(site: Site) -> tuple[str, ...]:
     """Return the methods by which an event may be located again: those that are registered, and the site's own.
 
-    A client cannot name others, for naming one by MODULE:NAME runs code.
+    A client cannot name another one by MODULE:NAME, because that would run code.
     """
     return tuple(dict.fromkeys((*METHODS, site.fusion.method)))
 
@@ -133,24 +135,25 @@ def relocate(
     Parameters
     ----------
     site : Site
-        With the poses that are in force now.
+        The site with the poses that are in force.
     folder : ClipReader
     event_id : str
     method : str
         One of `known_methods`.
     set_up : "then" or "now"
     give_way : callable
-        Is called before each array is read and before each step of the fusion; ends it by an error.
+        Function that is called before each array is read and before each step of the fusion; an error that it raises
+        ends the computation.
     most_bytes : int or None
         Most bytes of decoded samples; None for no limit.
 
     Raises
     ------
-    NoClipError
-        If the event has no recordings.
+    NoClipError, BusyError, ConfigError
+        If the event has no recordings, if `give_way` raises it, or if there is no such method.
     RelocationError
-        If the clip does not fit: another release has made it, it is damaged, an array is no longer there, a file cannot
-        be read, it takes more than `most_bytes`, or no sound of the event is in it.
+        If the clip cannot be used: another release wrote it, it is damaged, the site file no longer has one of its
+        arrays, a file cannot be read, its samples take more than `most_bytes`, or it has no sound of the event.
     """
     return relocate_sound(site, stored_sound(stored_clip(folder, event_id)), method, set_up, give_way, most_bytes)
 
@@ -163,7 +166,7 @@ def relocate_sound(
     give_way: GiveWay = _go_on,
     most_bytes: int | None = None,
 ) -> Relocation:
-    """Locate an event again from its sound, as `relocate` does."""
+    """Locate an event again from its sound, as `relocate` does, with the same errors but `NoClipError`."""
     event_id = sound.event_id
     if most_bytes is not None:
         check_memory(sound, most_bytes)
@@ -186,7 +189,7 @@ def relocate_sound(
 
 
 def _sources(site: Site, frames: Sequence[Frame], method: str, sound: StoredSound, give_way: GiveWay) -> list[Event]:
-    """Return the events, one for each source, of the sound of a clip; none if it has no active frame of it."""
+    """Return the events in the sound of a clip, one for each source; none if no frame of the event is active."""
     event_id, start_ns = sound.event_id, sound.start_ns
     sources = [
         event
@@ -195,7 +198,8 @@ def _sources(site: Site, frames: Sequence[Frame], method: str, sound: StoredSoun
     ]
     if sources:
         return sources
-    # a part of a longer sound, which was split: what the clip has of the part before is no event of its own
+    # The event is a part of a longer sound that was split. The end of the part before, which the clip has as well, must
+    # not become an event.
     start = round(start_ns / FRAME_NS)
     quiet = [replace(frame, active=frame.active and frame.frame_index >= start) for frame in frames]
     found = events_of(site, quiet, method, reported_until=start, give_way=give_way)
@@ -210,14 +214,17 @@ def events_of(
 ) -> list[Event]:
     """Locate the events in frames of a site's arrays, on joint frame indices, by the fusion that locates live sound.
 
-    Requested frames are given only if the fusion requests them. Frames before `reported_until` are in no pre-roll.
+    Frames that the clip has because they were requested are passed to the fusion only if it requests them again. Frames
+    before `reported_until` belong to no event's pre-roll.
 
     Raises
     ------
-    ConfigError
-        If there is no such method.
+    BusyError, ConfigError
+        If `give_way` raises it, or if there is no such method.
     """
-    from livessl.site.build.fusion import make_fusion  # what computes is loaded when it is needed first
+    from livessl.site.build.fusion import (
+        make_fusion,  # the estimators are imported at the first use, because that takes time
+    )
 
     fusion = make_fusion(site, method, updates=False, corrects_clocks=False)
     if reported_until is not None:
@@ -232,14 +239,15 @@ def events_of(
     outputs: list[Output] = []
     while sent:
         give_way()
-        end, end_ns = sent[0].frame_index + STRIDE, (sent[0].frame_index + STRIDE + 1) * FRAME_NS
+        end = sent[0].frame_index + STRIDE - 1
+        end_ns = (end + 1) * FRAME_NS
         taken = [frame for frame in sent if frame.frame_index <= end]
         sent = sent[len(taken) :]
         fresh = fusion.step(taken, end_ns, complete_until=end)
         while requests := [output for output in fresh if isinstance(output, BackfillRequest)]:
             give_way()
             outputs += fresh
-            for request in requests:  # what is not in the clip does not come any more
+            for request in requests:  # frames that the clip does not have never arrive
                 fusion.set_answers(request.array, False)
             answers = [
                 frame for one in requests for frame in kept[one.array] if one.first <= frame.frame_index <= one.last
@@ -255,12 +263,12 @@ def events_of(
 
 
 def _specs(site: Site, sound: StoredSound) -> dict[str, ArraySpec]:
-    """Return the arrays of a clip as they were then, in the bands of now.
+    """Return the arrays of a clip with their poses at that time and their present bands.
 
     Raises
     ------
     RelocationError
-        If one of them is no longer there, or has another number of microphones now.
+        If the site file no longer has one of them, or has it with another number of microphones.
     """
     now = {spec.name: spec for spec in site.processed}
     specs = {}
@@ -282,7 +290,7 @@ def _is_moved(then: ArraySpec, now: ArraySpec) -> bool:
 
 
 class Relocator:
-    """Locates events of a running server again, one at a time, by a thread of low priority. Every thread may call it.
+    """Locates events of a running server again, one at a time, on a thread of low priority. Every thread may call it.
 
     Parameters
     ----------
@@ -302,12 +310,12 @@ class Relocator:
         self._overload = overload
         self._one_at_a_time = threading.Lock()
         self._stopping = threading.Event()
-        self._ended: threading.Event | None = None  # of the computation that runs, or ran last
+        self._ended: threading.Event | None = None  # set at the end of the latest computation
 
     def stop(self) -> None:
-        """Refuse the request that waits, and all further ones; wait for nothing.
+        """Refuse the waiting request and all later ones, and return at once.
 
-        The computation that runs ends at its next step.
+        A running computation ends at its next step.
         """
         self._stopping.set()
         ended = self._ended
@@ -320,17 +328,22 @@ class Relocator:
         return self._site()
 
     def relocate(self, event_id: str, method: str, set_up: SetUp) -> tuple[Relocation, Site, float]:
-        """Locate an event again, and wait for it, as the function does.
+        """Locate an event again as the function `relocate` does, and wait for the result.
 
-        Return also the site by which it was located, whose poses may change meanwhile, and how long it took, in
-        seconds.
+        Returns
+        -------
+        Relocation
+        Site
+            The site by which it was located; the poses in force may have changed since.
+        float
+            Time that it took, in seconds.
 
         Raises
         ------
         BusyError
             If another event is being located again, the server is stopping, or it is or becomes overloaded.
-        NoClipError, RelocationError
-            As the function.
+        NoClipError, ConfigError, RelocationError
+            As `relocate` raises them.
         """
         self._give_way()
         if not self._one_at_a_time.acquire(blocking=False):  # a thread that waited would be missing for other requests
@@ -351,17 +364,17 @@ class Relocator:
             raise BusyError("the server is overloaded, and live sound comes first; try again when it is not")
 
     def _at_leisure(self, work: Callable[[], Relocation]) -> Relocation:
-        """Do some work on a thread of low priority of its own, and wait for it or for `stop`; raise what it raises."""
+        """Call `work` on a new thread of low priority, wait for its end or for `stop`, and raise its error."""
         made: list[Relocation] = []
         failed: list[BaseException] = []
         self._ended = ended = threading.Event()
 
         def run() -> None:
-            with suppress(OSError):  # a system that does not know priorities of threads
+            with suppress(OSError):  # the system has no priorities of threads
                 os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)
             try:
                 made.append(work())
-            except BaseException as error:  # noqa: BLE001 - it is raised by the thread that waits
+            except BaseException as error:  # noqa: BLE001 - the waiting thread raises it
                 failed.append(error)
             ended.set()
 
@@ -377,7 +390,10 @@ class Relocator:
 
 
 def distance_m(stored_m: Sequence[float] | None, again: Event) -> float | None:
-    """Return the distance between the stored position and the one found again, metres; None without one of them."""
+    """Return the distance, in metres, between the stored position and the new one.
+
+    It is None if there is no stored position, if there is no new one, or if the event is now refused.
+    """
     if stored_m is None or again.estimate is None or again.status is Status.REFUSED:
         return None
     return float(np.linalg.norm(again.estimate.position_m - np.array(stored_m)))

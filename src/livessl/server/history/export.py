@@ -42,13 +42,13 @@ _LISTS: Final = frozenset({"arrays", "heard_by", "zones"})
 
 
 def json_lines(pages: Pages) -> Iterator[bytes]:
-    """Yield events as lines of one JSON object each, in the form of `GET events/{id}`."""
+    """Yield one line for each event: a JSON object as in the list of `GET events`, without the `v` of an answer."""
     for rows in pages:
         yield b"".join(row.body.encode() + b"\n" for row in rows)
 
 
 def csv_lines(pages: Pages) -> Iterator[bytes]:
-    """Yield CSV (RFC 4180) with a head; names in a list are separated by blanks, and what is null is empty."""
+    """Yield CSV (RFC 4180) with a header row. Names in a list are separated by spaces, and a null is an empty cell."""
     yield _csv([COLUMNS])
     for rows in pages:
         yield _csv([_cell(value) for value in flat(row.event).values()] for row in rows)
@@ -88,7 +88,7 @@ def parquet(pages: Pages) -> Iterator[bytes]:
 
 
 def flat(event: JsonObject) -> JsonObject:
-    """Return an event's columns."""
+    """Return the value of each of the `COLUMNS` for an event."""
     found = {name: event.get(name) for name in COLUMNS}
     position = event.get("position_m")
     if position is not None:
@@ -105,7 +105,8 @@ FORMATS: Final[dict[str, tuple[str, Callable[[Pages], Iterator[bytes]]]]] = {
     "jsonl": ("application/octet-stream", json_lines),
     "parquet": ("application/octet-stream", parquet),
 }
-"""Media type and encoder of each format; generators of clients do not know the types of JSON Lines and Parquet."""
+"""Media type and encoder of each format. JSON Lines and Parquet are `application/octet-stream`, because generators of
+clients do not know their own types."""
 
 
 def _cell(value: Any) -> Any:
@@ -119,7 +120,7 @@ def _csv(rows: Iterable[Iterable[Any]]) -> bytes:
 
 
 class _Drain(io.RawIOBase):
-    """A file that is written only, and emptied by `take`."""
+    """A file that can only be written; `take` returns what was written since the last call."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -22,17 +22,17 @@ class Cursor(NamedTuple):
 
     @classmethod
     def parse(cls, text: str) -> Cursor:
-        """Return the cursor of which `text` is the text form.
+        """Return the cursor for its text form, the inverse of `str`.
 
         Raises
         ------
         ValueError
-            If the text is not that of a cursor.
+            If the text is not a cursor.
         """
         parts = re.fullmatch(r"(-?[0-9]{1,19})-([0-9]{1,19})", text, re.ASCII)
         cursor = None if parts is None else cls(*map(int, parts.groups()))
         if cursor is None or not all(abs(part) < 2**63 for part in cursor):
-            raise ValueError(f"expected the next_cursor of the page before, got {text!r}")
+            raise ValueError(f"expected a cursor of a page, got {text!r}")
         return cursor
 
 
@@ -52,9 +52,9 @@ class Query:
     before : Cursor or None
         Cursor of an event: only older ones are found.
     after : Cursor or None
-        Cursor of an event: only newer ones are found, those next to it first of all.
+        Cursor of an event: only newer ones are found, and of these the ones next to it.
     oldest_first : bool
-        Whether the order is the other one; `before` is then the cursor of an event that all found are newer than.
+        True to find the oldest events first; only events newer than `before` are then found.
     status : str or None
         `located`, `direction-only` or `refused`.
     min_level_dbfs : float or None
@@ -62,9 +62,9 @@ class Query:
     array : str or None
         Array that detected the event or contributed to it.
     text : str or None
-        Part of the event's id, status, reason, method, zones or arrays, in any case.
+        Part of the event's id, status, reason, method, zones or arrays, ignoring case.
     excluded : bool or None
-        Whether the event lies in an excluded zone.
+        True for events in excluded zones only, False for all others only.
     site : str or None
         Site that the event comes from, in the history of a hub.
     """

@@ -1,4 +1,5 @@
 // The WebSocket to the server: it always reconnects, and measures how long the server has been silent.
+// header.js words the state of the connection on the dashboard; embed.js uses client.js, and words it itself.
 
 import { protocols } from "./access.js";
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 from livessl.errors import RunError
-from livessl.server.zones.zone_map import ZoneMap
+from livessl.server.zones.zone_map import ZoneMap, no_zone
 from livessl.site.checks import zone_faults
 from livessl.site.models import Site
 from livessl.site.zone_models import Zone
@@ -92,7 +92,7 @@ class ZoneBook:
         """
         with self._lock:
             if name not in self.current.zones:
-                raise LookupError(f"no zone {name!r}; zones are {', '.join(self.current.zones) or 'none'}")
+                raise LookupError(no_zone(name, self.current.zones))
             drawn = self._changeable(name)
             users = self._users(name)
             if users:

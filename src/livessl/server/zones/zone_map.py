@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -17,6 +17,12 @@ NAMED: Final = 0.05
 
 EXCLUDED: Final = 0.5
 """Probability of an excluded zone from which on what lies there is excluded."""
+
+
+def no_zone(name: str, zones: Iterable[str]) -> str:
+    """Return the sentence that a site has no zone of this name, with the names of its `zones`."""
+    known = ", ".join(zones)
+    return f"no zone {name!r}; zones are {known}" if known else f"no zone {name!r}; this site has no zones"
 
 
 class ZoneMap:

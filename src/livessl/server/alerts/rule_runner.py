@@ -1,4 +1,8 @@
-"""Applies the rules of a site to events, arrays and findings, and puts alerts into the outbox. It starts no thread."""
+"""Applies the rules of a site to events, tracks, arrays and findings, and stores new alerts with the rules' states.
+
+`rules` decides whether a rule alerts (conditions on events, counts, hold-off), `schedule` when, and `conditions` about
+arrays and findings. This module starts no thread.
+"""
 
 from __future__ import annotations
 
@@ -39,8 +43,8 @@ class _Case(NamedTuple):
     make: Callable[[int], JsonObject]
 
 
-class Judge:
-    """The rules of a site with their states; every thread may call it.
+class RuleRunner:
+    """Keeps the rules of a site with their states. Every thread may call it.
 
     Parameters
     ----------
