@@ -221,8 +221,8 @@ def _limits(loads: Sequence[Json]) -> list[Block]:
         f"A site of {len(ARRAYS)} arrays with {EVENTS_PER_HOUR} events an hour sends {MESSAGES_PER_HOUR} messages an "
         f"hour, which take {day / 1e6:.1f} MB of the stream and {stored / 1e6:.1f} MB of the database a day (by the "
         f"figures of {longest['sites']} sites). The processor times include the sites' reports on themselves: in the "
-        f"run of {sites} sites, {reports:.1f} reports came with each message; at the pace of real time, {real:.1f} reports "
-        "come with each message."
+        f"run of {sites} sites, {reports:.1f} reports came with each message; at the pace of real time, {real:.1f} "
+        "reports come with each message."
     )
     return [costs, f"Limits, by the processor times of {sites} sites:", Table(("limit", "sites"), rows)]
 
