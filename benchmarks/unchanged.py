@@ -62,7 +62,7 @@ def _parser() -> argparse.ArgumentParser:
         "--sounds",
         type=_at_least(1),
         default=default.sounds,
-        help=f"sounds of each kind for the exactness (default: {default.sounds}: 180 maps)",
+        help=f"sounds of each kind for the exactness (default: {default.sounds})",
     )
     parser.add_argument(
         "--scenes", type=_at_least(1), default=default.scenes, help=f"simulated scenes (default: {default.scenes})"

@@ -141,11 +141,7 @@ def _action(
         epilog=f"example: livessl calibrate {example}",
     )
     sub.set_defaults(act=act)
-    add_recordings(
-        sub,
-        "site file (default: the session's own); without --session and --wav, the command uses the server that runs "
-        "with this site file",
-    )
+    add_recordings(sub, "site file (default: the session's); without recordings, the server that runs with it is used")
     add_server(sub, f"the command then {prompts}")
     sub.add_argument(
         "--wait",

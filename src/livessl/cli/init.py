@@ -15,6 +15,22 @@ def add_arguments(parser: Any) -> None:
     parser.add_argument(
         "site", type=Path, nargs="?", default=Path("site.yaml"), help="file to write (default: site.yaml)"
     )
+    _add_room(parser)
+    _add_arrays(parser)
+    _add_interfaces(parser)
+    parser.add_argument(
+        "--yes", action="store_true", help="ask nothing; use the default of everything that is not given"
+    )
+    parser.add_argument("--force", action="store_true", help="replace a file that exists")
+    parser.add_argument(
+        "--drawing",
+        type=Path,
+        metavar="FILE",
+        help="instead of a site file, write a printable drawing (SVG) of the first array",
+    )
+
+
+def _add_room(parser: Any) -> None:
     parser.add_argument("--name", type=draft_arguments.name, help="name of the site (default: lab)")
     parser.add_argument(
         "--room",
@@ -22,6 +38,15 @@ def add_arguments(parser: Any) -> None:
         metavar="X,Y,Z",
         help="length, width and height of the room in metres (default: 6,5,2.7)",
     )
+    parser.add_argument(
+        "--temperature",
+        type=draft_arguments.finite,
+        metavar="C",
+        help="air temperature in degrees Celsius (default: 20)",
+    )
+
+
+def _add_arrays(parser: Any) -> None:
     parser.add_argument(
         "--array",
         action="append",
@@ -34,6 +59,9 @@ def add_arguments(parser: Any) -> None:
         "it about the vertical axis, in degrees, counterclockwise seen from above. What is left out is proposed",
     )
     parser.add_argument("--arrays", type=draft_arguments.array_count, metavar="N", help="number of arrays (default: 2)")
+
+
+def _add_interfaces(parser: Any) -> None:
     parser.add_argument(
         "--interface",
         action="append",
@@ -56,22 +84,6 @@ def add_arguments(parser: Any) -> None:
         metavar="ARRAY=1,2,3,4",
         help="inputs of the interface to which the microphones of ARRAY are connected, in the order of the "
         "microphones, counted from 1; repeat the option for each array (default: the next free inputs, in order)",
-    )
-    parser.add_argument(
-        "--temperature",
-        type=draft_arguments.finite,
-        metavar="C",
-        help="air temperature in degrees Celsius (default: 20)",
-    )
-    parser.add_argument(
-        "--yes", action="store_true", help="ask nothing; use the default of everything that is not given"
-    )
-    parser.add_argument("--force", action="store_true", help="replace a file that exists")
-    parser.add_argument(
-        "--drawing",
-        type=Path,
-        metavar="FILE",
-        help="instead of a site file, write a printable drawing (SVG) of the first array",
     )
 
 
