@@ -291,10 +291,10 @@ def _cpu_s(pid: int) -> float:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--clients", type=int, default=500, help="number of clients (default 500)")
-    parser.add_argument("--stalled", type=int, default=50, help="number of clients that never read (default 50)")
-    parser.add_argument("--rate", type=float, default=20.0, metavar="HZ", help="updates per second (default 20)")
-    parser.add_argument("--seconds", type=float, default=60.0, help="measured time, after a warm-up (default 60)")
+    parser.add_argument("--clients", type=int, default=500, help="number of clients (default: 500)")
+    parser.add_argument("--stalled", type=int, default=50, help="number of clients that never read (default: 50)")
+    parser.add_argument("--rate", type=float, default=20.0, metavar="HZ", help="updates per second (default: 20)")
+    parser.add_argument("--seconds", type=float, default=60.0, help="measured time, after a warm-up (default: 60)")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args(arguments)
     found: dict[str, Any] = asdict(measure(options.clients, options.stalled, options.rate, options.seconds))

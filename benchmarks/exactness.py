@@ -87,7 +87,7 @@ def main() -> int:
     """Compare, write exactness.json, and fail unless all results are the same."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")
-    parser.add_argument("--sounds", type=int, default=SOUNDS, help=f"sounds of each kind (default {SOUNDS}: 180 maps)")
+    parser.add_argument("--sounds", type=int, default=SOUNDS, help=f"sounds of each kind (default: {SOUNDS})")
     arguments = parser.parse_args()
     about = machine.describe()
     with threadpool_limits(limits=1), counted("maps", "sound") as show:

@@ -126,7 +126,7 @@ def main() -> int:
     parser.add_argument("--paced", type=float, default=20.0, help="seconds at the pace of real time (default: 20)")
     parser.add_argument("--patience", type=float, default=300.0, help="longest wait for the hub (default: 300 s)")
     parser.add_argument("--sqlite", action="store_true", help="an SQLite file instead of PostgreSQL")
-    parser.add_argument("--beside", default="nothing else", help="what the machine does meanwhile, for the page")
+    parser.add_argument("--beside", default="nothing else", help="what else the machine did (default: nothing else)")
     parser.add_argument("--out", type=Path, required=True, help="folder of the figures")
     parser.add_argument("--into", type=Path, help="page into which the tables are written")
     arguments = parser.parse_args()

@@ -89,8 +89,8 @@ def _about(runs: Sequence[Json]) -> str:
     machine = run["machine"]
     loads = ", ".join(f"{each['machine']['load_before']:.1f}" for each in runs)
     return (
-        f"{machine['cpu']}, {machine['cores']} cores; {run['database']}; the machine did {run['beside']} meanwhile "
-        f"(load average at the begin of each run: {loads})."
+        f"{machine['cpu']}, {machine['cores']} cores; {run['database']}. Besides the benchmark, the machine did "
+        f"{run['beside']} (load average at the start of each run: {loads})."
     )
 
 
@@ -220,8 +220,9 @@ def _limits(loads: Sequence[Json]) -> list[Block]:
     costs = (
         f"A site of {len(ARRAYS)} arrays with {EVENTS_PER_HOUR} events an hour sends {MESSAGES_PER_HOUR} messages an "
         f"hour, which take {day / 1e6:.1f} MB of the stream and {stored / 1e6:.1f} MB of the database a day (by the "
-        f"figures of {longest['sites']} sites). Processor times include those of reports: with {sites} sites, "
-        f"{reports:.1f} came with each message; at the pace of real time {real:.1f} do."
+        f"figures of {longest['sites']} sites). The processor times include the sites' reports on themselves: in the "
+        f"run of {sites} sites, {reports:.1f} reports came with each message; at the pace of real time, {real:.1f} "
+        "reports come with each message."
     )
     return [costs, f"Limits, by the processor times of {sites} sites:", Table(("limit", "sites"), rows)]
 
@@ -259,8 +260,11 @@ def _fit(runs: Sequence[Json]) -> list[Block]:
         measured = "p95_ms" if times.get("cpu_p95_ms") is None else "cpu_p95_ms"
         fit = Fit.power(counts, [run["answers"][kind][measured] for run in runs])
         lines.append(f"{kind}: exponent {fit.exponent:.2f}, so {fit(MANY):.0f} ms at 10⁸ events")
-    what = "By a power law through the processor times where they were measured, else through the times of answers"
-    return [f"{what}, which is a guess beyond the last of them:", tuple(lines)]
+    what = (
+        "A power law was fitted to the processor times where they were measured, otherwise to the times of answers. "
+        f"Beyond {max(counts):.0f} stored events it is an extrapolation:"
+    )
+    return [what, tuple(lines)]
 
 
 def real_time_per_s(sites: int) -> float:

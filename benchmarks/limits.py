@@ -96,10 +96,10 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--events", type=Path, required=True, help="clips named like doorslam001.wav")
     parser.add_argument(
-        "--positions", type=int, default=40, help="number of source positions, with four sounds each (default 40)"
+        "--positions", type=int, default=40, help="number of source positions, with four sounds each (default: 40)"
     )
     parser.add_argument(
-        "--snr", type=float, default=10.0, help="level of the sound above the noise, in dB (default 10)"
+        "--snr", type=float, default=10.0, help="level of the sound above the noise, in dB (default: 10)"
     )
     parser.add_argument("--seed", type=int, default=9191)
     arguments = parser.parse_args()

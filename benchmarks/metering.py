@@ -45,7 +45,7 @@ def spent_s(made: Pipeline, samples: Float32Array, begin: int) -> float:
 def main() -> None:
     """Print a table."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seconds", type=int, default=30, help="seconds of sound for each row (default 30)")
+    parser.add_argument("--seconds", type=int, default=30, help="seconds of sound for each row (default: 30)")
     seconds = parser.parse_args().seconds
     print("| channels | without levels | with levels | levels alone |\n|---|---|---|---|")
     for arrays in (1, 2, 4):

@@ -311,9 +311,9 @@ def main() -> int:
     """Measure everything and write peers.json."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")
-    parser.add_argument("--rounds", type=int, default=15, help="rounds of all codes, side by side (default 15)")
+    parser.add_argument("--rounds", type=int, default=15, help="rounds of all codes, side by side (default: 15)")
     parser.add_argument(
-        "--search-rounds", type=int, default=60, help="rounds of our search and maps alone (default 60)"
+        "--search-rounds", type=int, default=60, help="rounds of our search and maps alone (default: 60)"
     )
     arguments = parser.parse_args()
     about = machine.describe()

@@ -53,24 +53,24 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--skip", nargs="+", choices=list(PROBES), default=[], metavar="PROBE", help="leave these out")
     default = Options()
     parser.add_argument(
-        "--seeds", type=_at_least(1), default=default.seeds, help=f"worlds of the faults (default {default.seeds})"
+        "--seeds", type=_at_least(1), default=default.seeds, help=f"worlds of the faults (default: {default.seeds})"
     )
     parser.add_argument(
-        "--jobs", type=_at_least(1), default=default.jobs, help=f"processes for them (default {default.jobs})"
+        "--jobs", type=_at_least(1), default=default.jobs, help=f"processes for them (default: {default.jobs})"
     )
     parser.add_argument(
         "--sounds",
         type=_at_least(1),
         default=default.sounds,
-        help=f"sounds of each kind for the exactness (default {default.sounds}: 180 maps)",
+        help=f"sounds of each kind for the exactness (default: {default.sounds})",
     )
     parser.add_argument(
-        "--scenes", type=_at_least(1), default=default.scenes, help=f"simulated scenes (default {default.scenes})"
+        "--scenes", type=_at_least(1), default=default.scenes, help=f"simulated scenes (default: {default.scenes})"
     )
     parser.add_argument(
         "--performance", action="store_true", help="also compare `livessl bench`; this never changes the exit code"
     )
-    parser.add_argument("--repeats", type=_at_least(2), default=3, help="performance: runs of each tree (default 3)")
+    parser.add_argument("--repeats", type=_at_least(2), default=3, help="performance: runs of each tree (default: 3)")
     return parser
 
 

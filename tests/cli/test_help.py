@@ -15,7 +15,9 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from cli.command_runs import COMMANDS, Run, interrupted
 from livessl import __version__
 from livessl.capture.portaudio import InputDevice
+from livessl.cli import demo
 from livessl.cli.main import main
+from livessl.cli.parser import Parser
 from livessl.site.models import Site
 from small_site import site_of, write_site
 
@@ -25,6 +27,28 @@ def test_help_shows_an_example(run: Run, command: str) -> None:
     done = run(command, "--help")
     assert done.code == 0
     assert re.search(rf"^example: livessl {command}", done.out, re.MULTILINE)
+
+
+ACTIONS = (
+    *("keys server", "keys node", "keys enrol", "keys token", "keys revoke", "keys list"),
+    *("calibrate verify", "calibrate poses", "calibrate refine", "config show"),
+)
+
+
+@pytest.mark.parametrize("command", [*COMMANDS, *ACTIONS])
+def test_defaults_are_written_in_one_form(run: Run, command: str) -> None:
+    """An option is described by a whole phrase, and a default is written as `(default: X)`."""
+    shown = " ".join(run(*command.split(), "--help").out.split())
+    assert re.findall(r"\(default\b(?!: )[^)]*\)", shown) == []
+    assert "repeatable" not in shown
+
+
+def test_number_of_sounds_of_the_demo_has_the_name_that_it_has_elsewhere() -> None:
+    """`--events` is a folder in `simulate` and `evaluate`; in `demo` it stays as an older name of `--count`."""
+    for option in ("--count", "--events"):
+        parser = Parser()
+        demo.add_arguments(parser)
+        assert parser.parse_args([option, "3"]).count == 3
 
 
 def test_help_lists_the_commands(run: Run) -> None:

@@ -81,3 +81,34 @@ def test_options_without_effect_are_refused(run: Run, tmp_path: Path) -> None:
         assert (done.code, "have no effect" in done.err) == (2, True)
     done = run("doctor", "--site", site, "--url", f"http://127.0.0.1:{free_port()}")
     assert (done.code, "no answer from a server" in done.err) == (1, True)
+
+
+LOCALIZER = "evaluate localizer --out results --events sounds"
+
+
+@pytest.mark.parametrize(
+    ("command", "refusal"),
+    [
+        (
+            "replay session --server tcp://127.0.0.1:9 --json --method onset",
+            "replay: --json and --method have no effect with --server, because that server locates and publishes the "
+            "events; remove them",
+        ),
+        ("replay session --server tcp://127.0.0.1:9 --json", "replay: --json has no effect with --server, because"),
+        (f"{LOCALIZER} --with earlier", "evaluate: --with has no effect with localizer; remove it"),
+        (f"{LOCALIZER} --segment peak --no-band-limit", "evaluate: --segment and --no-band-limit have no effect"),
+        (
+            "evaluate office --out results --events sounds --half development",
+            "--half has no effect with office; remove",
+        ),
+        ("evaluate report --out r --with e --events s", "--events has no effect with report, which simulates nothing;"),
+        ("bench --arrays 8 --spin", "bench: --arrays and --spin have no effect without --live; remove them"),
+        ("relocate clips --site site.yaml --token-file token", "relocate: --token-file has no effect without --url"),
+        ("doctor --session session --token-file token", "doctor: --token-file has no effect without --url"),
+    ],
+)
+def test_options_that_another_option_makes_useless_are_refused(run: Run, command: str, refusal: str) -> None:
+    done = run(*command.split())
+    assert (done.code, done.out) == (2, "")
+    assert refusal in done.err
+    assert len(done.err.splitlines()) == 1

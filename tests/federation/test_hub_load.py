@@ -164,9 +164,9 @@ def test_tables_name_the_limit_that_comes_first(tmp_path: Path) -> None:
     limits = ["the hub | 2000 |", "the stream's 10 GB, to keep a day | 2182 |", "what the hub took in here | 37696 |"]
     places = [said.index(limit) for limit in limits]
     assert places == sorted(places)
-    assert "0.1 came with each message; at the pace of real time 3.8 do" in said
+    assert "0.1 reports came with each message; at the pace of real time, 3.8 reports come with each" in said
     assert said.index("| 10 | 80 | 2000 of 60 min |") < said.index("| 1000 | 8000 | 200000 of 60 min |")
-    assert "did nothing else meanwhile (load average at the begin of each run: 0.2, 0.2)" in said
+    assert "the machine did nothing else (load average at the start of each run: 0.2, 0.2)" in said
     late = {**load(1000), "is_drained": False, "minutes": 15}
     del late["paced"]
     (tmp_path / "sites-1000.json").write_text(json.dumps(late))

@@ -89,6 +89,22 @@ def test_a_site_is_away_after_some_silence(age_s: float, status: str) -> None:
     }
 
 
+@pytest.mark.parametrize(
+    ("states", "status"),
+    [
+        ({}, "starting"),
+        ({"north": "starting", "south": "healthy"}, "starting"),
+        ({"north": "healthy", "south": "disabled"}, "ok"),
+        ({"north": "lost", "south": "starting"}, "degraded"),
+        ({"north": "disabled", "south": "disabled"}, "degraded"),
+    ],
+)
+def test_condition_of_a_site_is_that_of_its_enabled_arrays(states: dict[str, str], status: str) -> None:
+    """A site that locates nothing, because all its arrays are disabled, is not well."""
+    contact = Contact("lab", 0.0, START_NS, 0, 0, {})
+    assert describe(contact, states)["status"] == status
+
+
 # --- batches
 
 SITES, NAMES = ("lab", "yard"), ("a", "b")

@@ -153,14 +153,14 @@ def test_full_disk_delays_what_is_stored_and_not_what_is_published(caplog: pytes
     desk.finish([event(10, 19), event(30, 39)], until=START + 40)
     desk.finish([event(50, 59)], until=START + 60)
     assert len(desk.published) == desk.log.published == 3
-    assert (desk.log.is_saved, desk.log.unsaved, desk.log.unkept, desk.stored) == (False, 3, 0, [])
+    assert (desk.log.is_saved, desk.log.unsaved, desk.log.discarded, desk.stored) == (False, 3, 0, [])
     assert "disk full" in caplog.text
     desk.store.full = False
     desk.log.retry()  # too early
     assert desk.log.unsaved == 3
     desk.clock.time_ns += RETRY_NS
     desk.log.retry()
-    assert (desk.log.is_saved, desk.log.unsaved, desk.log.unkept) == (True, 0, 0)
+    assert (desk.log.is_saved, desk.log.unsaved, desk.log.discarded) == (True, 0, 0)
     assert desk.stored == desk.published
 
 
@@ -182,7 +182,7 @@ def test_events_beyond_the_limit_are_given_up_and_counted() -> None:
     sizes = [MAX_UNSAVED // 2, MAX_UNSAVED // 2, 1]
     for first, last in pairwise(np.cumsum([0, *sizes])):
         desk.finish([event(10 * int(n), 10 * int(n) + 5) for n in range(first, last)], until=START + 10 * int(last))
-    assert desk.log.unkept == sizes[0]
+    assert desk.log.discarded == sizes[0]
     assert desk.log.unsaved == sizes[1] + 1
     assert desk.log.published == sum(sizes)
 

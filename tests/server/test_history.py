@@ -63,7 +63,7 @@ def _go_down_and_come_back(server: PostgreSQL, store: Store) -> None:
     server.start()
     wait_until(lambda: store.backlog.unsaved == 0, "all to be stored")
     found, _ = store.find(Query())
-    assert store.backlog.unkept == 0
+    assert store.backlog.discarded == 0
     assert {each["id"]: each["duration_s"] for each in found if each["duration_s"] >= 2} == {
         f"small-{k % 20}": float(k) for k in range(10, 30)
     }
@@ -86,7 +86,7 @@ def test_event_that_the_database_refuses_holds_up_no_other(
     for name in ("small-1", "small\0-2", "small-3"):
         store.backlog.put(Write(lambda name=name: store.add({**small_event(0), "id": name}, 0), 1, False), 0)  # type: ignore[misc]
     assert [found["id"] for found in store.find(Query())[0]] == ["small-3", "small-1"]
-    assert (store.backlog.unkept, store.backlog.unsaved) == (1, 0)
+    assert (store.backlog.discarded, store.backlog.unsaved) == (1, 0)
     assert "cannot store event 'small\\x00-2'" in caplog.text
     store.close()
 
@@ -113,7 +113,7 @@ def test_nobody_waits_for_a_database_that_stands_still(monkeypatch: pytest.Monke
     for k in range(1, MAX_UNSAVED + 6):
         waiting.put(Write(lambda k=k: jam.write(k), 1, False), 0)  # type: ignore[misc]
     waiting.settle()
-    assert (waiting.unsaved, waiting.unkept) == (MAX_UNSAVED, 6)
+    assert (waiting.unsaved, waiting.discarded) == (MAX_UNSAVED, 6)
     jam.go.set()
     wait_until(lambda: waiting.unsaved == 0, "all to be written")
     waiting.stop()
@@ -128,7 +128,7 @@ def test_what_waits_is_bounded_in_bytes_and_given_up_entries_are_counted(monkeyp
     assert jam.begun.wait(60)
     for k in range(1, 5):
         waiting.put(Write(lambda k=k: jam.write(k), k % 2, False, others=2 * (1 - k % 2), nbytes=60 - k), 0)  # type: ignore[misc]
-    assert (waiting.unkept, waiting.unkept_others, waiting.unsaved) == (2, 2, 0)  # 900 + 56 bytes are left
+    assert (waiting.discarded, waiting.discarded_others, waiting.unsaved) == (2, 2, 0)  # 900 + 56 bytes are left
     jam.go.set()
     waiting.settle(60)
     waiting.stop()

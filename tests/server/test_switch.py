@@ -40,6 +40,22 @@ def test_disabled_array_is_shown_as_such() -> None:
         assert array(server.url, "north")["state"] == "starting"
 
 
+def test_server_is_degraded_while_all_its_arrays_are_disabled() -> None:
+    """With one array disabled, only the other one counts."""
+
+    def health(url: str) -> tuple[str, bool]:
+        found = httpx.get(f"{url}/api/v1/health").json()
+        return found["status"], "all arrays are disabled, so nothing is located; enable one" in found["reasons"]
+
+    with running_server(site_of()) as server:
+        put(server.url, "north", {"enabled": False})
+        assert health(server.url) == ("starting", False)
+        put(server.url, "south", {"enabled": False})
+        assert health(server.url) == ("degraded", True)
+        put(server.url, "south", {"enabled": True})
+        assert health(server.url) == ("starting", False)
+
+
 @pytest.mark.parametrize("body", [{}, {"enabled": "no"}, {"enabled": 0}, {"enabled": False, "why": "noise"}, [], None])
 def test_malformed_switch_is_refused(body: Any) -> None:
     with running_server(site_of()) as server:

@@ -4,12 +4,23 @@ from __future__ import annotations
 
 import argparse
 import json
-from typing import Any
+from typing import Any, Final
 
 from livessl.cli import argument, progress
 from livessl.cli.exits import OK
-from livessl.cli.options import add_json
+from livessl.cli.options import add_json, refuse_unused
 from livessl.clock import SystemClock
+
+LIVE_DEFAULTS: Final[dict[str, Any]] = {
+    "arrays": 4,
+    "clients": 4,
+    "watchers": 0,
+    "seconds": 20.0,
+    "spacing": 0.1,
+    "rt60": 0.3,
+    "spin": False,
+}
+"""Default of each option that belongs to --live."""
 
 
 def add_arguments(parser: Any) -> None:
@@ -21,38 +32,40 @@ def add_arguments(parser: Any) -> None:
     only.add_argument(
         "--arrays",
         type=argument.positive,
-        default=4,
         metavar="N",
-        help="number of arrays that send sound continuously (default 4)",
+        help="number of arrays that send sound continuously (default: 4)",
     )
     only.add_argument(
         "--clients",
         type=argument.positive,
-        default=4,
         metavar="N",
-        help="number of clients that subscribe to events and updates (default 4)",
+        help="number of clients that subscribe to events and updates (default: 4)",
     )
     only.add_argument(
         "--watchers",
         type=argument.count,
-        default=0,
         metavar="N",
-        help="number of clients that subscribe to the power map (default 0)",
+        help="number of clients that subscribe to the power map (default: 0)",
     )
+    only.add_argument("--seconds", type=argument.above_zero, help="seconds to measure, after a warm-up (default: 20)")
     only.add_argument(
-        "--seconds", type=argument.above_zero, default=20.0, help="seconds to measure, after a warm-up (default 20)"
-    )
-    only.add_argument(
-        "--spacing", type=argument.above_zero, default=0.1, metavar="M", help="spacing of the search grid (default 0.1)"
+        "--spacing",
+        type=argument.above_zero,
+        metavar="M",
+        help="spacing of the search grid, metres (default: 0.1)",
     )
     only.add_argument(
         "--rt60",
         type=argument.rt60,
-        default=0.3,
         metavar="S",
-        help="reverberation time of the simulated room (default 0.3)",
+        help="reverberation time of the simulated room, seconds (default: 0.3)",
     )
-    only.add_argument("--spin", action="store_true", help="run a busy process on every core during the measurement")
+    only.add_argument(
+        "--spin",
+        action="store_true",
+        help="keep every core busy with another process meanwhile, to measure a server on a busy machine",
+    )
+    only.set_defaults(**LIVE_DEFAULTS)
     add_json(parser, "print one JSON object")
 
 
@@ -61,6 +74,8 @@ def run(arguments: argparse.Namespace) -> int:
     from livessl.lab.bench import kernels, live
 
     if not arguments.live:
+        given = {f"--{option}": getattr(arguments, option) != default for option, default in LIVE_DEFAULTS.items()}
+        refuse_unused("bench", given, "without --live")
         with progress.counted("measuring", "round") as show:
             report = kernels.measure(SystemClock(), progress=show)
         print(json.dumps(report.as_json()) if arguments.json else kernels.table(report))

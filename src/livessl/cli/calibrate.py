@@ -82,7 +82,7 @@ def _add_poses(actions: Any) -> None:
         type=argument.above_zero,
         default=0.03,
         metavar="M",
-        help="how exactly you know the places, standard deviation in metres (default 0.03)",
+        help="standard deviation, in metres, of the errors of the places that you give (default: 0.03)",
     )
     add_calibration_file(sub)
     add_json(sub, "print one JSON object for each clap, each array and the speed of sound")
@@ -95,50 +95,60 @@ def _add_refine(actions: Any) -> None:
         _refine,
         "use sounds at unknown places to measure the arrays' poses; one array's pose must be right",
         "refine --site site.yaml --known north --write",
+        "uses the sounds that the server still keeps, and prompts for those that are missing",
     )
     sub.add_argument(
         "--known",
         action="append",
         default=[],
         metavar="ARRAY",
-        help="array whose pose in the site file is right; repeatable (default: the first)",
+        help="array whose pose in the site file is right, relative to which the others are measured; repeat the option "
+        "for each such array (default: the first array of the site file)",
     )
     sub.add_argument(
         "--position-std",
         type=argument.above_zero,
         default=POSITION_STD_M,
         metavar="M",
-        help="how exactly the site file's positions are known, standard deviation in metres "
-        f"(default {POSITION_STD_M:g}, as measured by tape)",
+        help="standard deviation, in metres, of the errors of the arrays' positions in the site file "
+        f"(default: {POSITION_STD_M:g}, as measured by tape)",
     )
     sub.add_argument(
         "--sounds",
         type=argument.positive,
         default=REFINED_SOUNDS,
         metavar="N",
-        help=f"number of sounds to wait for with a running server (default {REFINED_SOUNDS})",
+        help="number of sounds to use with a running server; those that it still keeps count "
+        f"(default: {REFINED_SOUNDS})",
     )
     add_calibration_file(sub)
     add_json(sub, "print one JSON object for each array and the speed of sound")
 
 
-def _action(actions: Any, name: str, act: Callable[[argparse.Namespace], int], text: str, example: str) -> Any:
+def _action(
+    actions: Any,
+    name: str,
+    act: Callable[[argparse.Namespace], int],
+    text: str,
+    example: str,
+    prompts: str = "prompts for each clap and waits for it",
+) -> Any:
     sub = actions.add_parser(
         name,
         help=text,
         description=f"{text[0].upper()}{text[1:]}. To use a running server, give its site file (--site) or its "
-        "address (--url); the command then prompts for each clap. To use recordings, give --session or --wav.",
+        f"address (--url); the command then {prompts}. To use recordings, give --session or --wav.",
         epilog=f"example: livessl calibrate {example}",
     )
     sub.set_defaults(act=act)
-    add_recordings(sub, "site file (default: the session's own); without recordings, its running server is used")
-    add_server(sub, "the command prompts for each clap and waits for it")
+    add_recordings(sub, "site file (default: the session's); without recordings, the server that runs with it is used")
+    add_server(sub, f"the command then {prompts}")
     sub.add_argument(
         "--wait",
         type=argument.above_zero,
         default=WAIT_S,
         metavar="S",
-        help=f"longest wait for each sound of a running server, seconds (default {WAIT_S:g})",
+        help=f"longest wait, in seconds, for each sound of a running server (default: {WAIT_S:g})",
     )
     return sub
 

@@ -19,7 +19,10 @@ def add_arguments(parser: Any) -> None:
     add_site(parser)
     parser.add_argument("--node", required=True, help="name of the node in the site file")
     add_joint(parser)
-    add_wav(parser, "play FILE in real time instead of using the device; repeat for each array of the node")
+    add_wav(
+        parser,
+        "use the sound of FILE, in real time, instead of the device; repeat the option for each array of the node",
+    )
     parser.add_argument("--loop", action="store_true", help="repeat the files until Ctrl-C")
     parser.add_argument(
         "--start-at",

@@ -37,8 +37,16 @@ def add_arguments(parser: Any) -> None:
     """Describe the command's arguments."""
     parser.add_argument("--once", action="store_true", help="run the scene once without opening a browser, and exit")
     add_json(parser)
-    parser.add_argument("--port", type=int, default=8000, help="port of the dashboard (default 8000)")
-    parser.add_argument("--events", type=argument.positive, default=8, help="number of sounds in the scene (default 8)")
+    parser.add_argument("--port", type=int, default=8000, help="port of the dashboard (default: 8000)")
+    parser.add_argument(
+        "--count",
+        "--events",
+        dest="count",
+        type=argument.positive,
+        default=8,
+        metavar="N",
+        help="number of sounds in the scene; --events is an older name of --count (default: 8)",
+    )
     parser.add_argument(
         "--sound-card",
         action="store_true",
@@ -109,7 +117,7 @@ def _prepared(
     """Return the scene, and what starts the processes that play it."""
     from livessl.lab import demo
 
-    port, events, loop = arguments.port, arguments.events, not arguments.once
+    port, events, loop = arguments.port, arguments.count, not arguments.once
     if not arguments.sound_card:
         site, scene = demo.prepare(directory, port, events, bar)
         return scene, lambda: demo.running(directory, site, loop=loop, clock=clock)

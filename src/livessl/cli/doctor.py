@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from livessl.cli import progress
 from livessl.cli.exits import FAILED, OK
-from livessl.cli.options import add_joint, add_json, add_wav, joints, read_site, wavs
+from livessl.cli.options import add_joint, add_json, add_wav, joints, read_site, refuse_unused, wavs
 from livessl.cli.output import complain, print_warnings
 from livessl.cli.server_answers import add_server, ask_for
 from livessl.errors import UseError
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 def add_arguments(parser: Any) -> None:
     """Describe the command's arguments."""
     add_recordings(parser)
-    add_server(parser, "its most recent sounds are examined")
+    add_server(parser, "its latest sounds are examined")
     add_json(parser, "print one JSON object per finding")
 
 
@@ -39,7 +39,12 @@ def add_recordings(parser: Any, site: str = "site file (default: the session's o
     """Add --site with a help text, --session, --wav, --channels and --joint, which `recordings_given` reads."""
     parser.add_argument("--site", type=Path, help=site)
     parser.add_argument(
-        "--session", action="append", type=Path, default=[], metavar="DIR", help="recorded session; repeatable"
+        "--session",
+        action="append",
+        type=Path,
+        default=[],
+        metavar="DIR",
+        help="recorded session; repeat the option for each session",
     )
     add_wav(parser, "WAV or FLAC recording of one array, instead of --session; repeat the option for each array")
     add_joint(parser)
@@ -54,6 +59,9 @@ def run(arguments: argparse.Namespace) -> int:
             "doctor: with --url the server's own sounds are examined, so that --session, --wav, --channels and --joint "
             "have no effect; remove them, or --url"
         )
+    if not arguments.url:
+        given = {"--token-file": arguments.token_file}
+        refuse_unused("doctor", given, "without --url, because no server is asked")
     examination, hidden = _ask(arguments.url, arguments.token_file) if arguments.url else _examine(arguments)
     for finding in examination.findings:
         print(

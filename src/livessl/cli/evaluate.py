@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from livessl.cli import argument, progress
 from livessl.cli.exits import OK, WRONG_USE
-from livessl.cli.options import add_json
+from livessl.cli.options import add_json, refuse_unused
 from livessl.cli.output import complain
 from livessl.lab.evaluate.layout import layout_of
 from livessl.lab.evaluate.paper import CLASSES, EXPERIMENTS, Settings, experiment_of
@@ -24,6 +24,15 @@ from livessl.site.load import load_site
 
 REPORT: Final = "report"
 """Name of the experiment that simulates nothing, and reports the results of earlier runs."""
+
+PAPER: Final = "García-Barrios et al., Applied Acoustics, doi:10.1016/j.apacoust.2022.109138"
+"""The paper whose experiments are repeated."""
+
+SEGMENT: Final = "longest"
+"""Default of --segment."""
+
+HALF: Final = "test"
+"""Default of --half."""
 
 ALONE: Final = (NOISE, *SESSIONS)
 """Scenarios of the localizer that cannot be combined with others."""
@@ -35,8 +44,9 @@ def add_arguments(parser: Any) -> None:
     add(
         "experiment",
         choices=[*sorted(EXPERIMENTS), LOCALIZER, REPORT],
-        help=f"diversity, office and one-array repeat experiments of the paper; {LOCALIZER} compares the methods onset "
-        f"and srp-phat; {REPORT} simulates nothing, and writes one report on the folders given by --with",
+        help=f"{', '.join(sorted(EXPERIMENTS))} repeat experiments of the paper ({PAPER}); {LOCALIZER} compares the "
+        f"methods onset and srp-phat; {REPORT} simulates nothing: it writes one report on the results of earlier runs "
+        "of the paper's experiments, in the folders given by --with",
     )
     add(
         "--site",
@@ -47,7 +57,7 @@ def add_arguments(parser: Any) -> None:
         "--events",
         type=Path,
         metavar="DIR",
-        help="folder of sounds; each file is named by class and number, such as doorslam001.wav",
+        help="folder of sound files, WAV or FLAC, each named by class and number, such as doorslam001.wav",
     )
     add(
         "--out",
@@ -63,7 +73,8 @@ def add_arguments(parser: Any) -> None:
         type=Path,
         default=[],
         metavar="DIR",
-        help="folder of results (--out of another run) to include in the report; repeat the option for each folder",
+        help="folder of results (--out of an earlier run of an experiment of the paper) to include in the report; "
+        f"repeat the option for each folder (not with {LOCALIZER})",
     )
     add("--jobs", type=argument.positive, help="number of parallel processes (default: one per core)")
     add(
@@ -83,11 +94,16 @@ def _add_simulation(group: Any) -> None:
         "--positions",
         type=argument.positive,
         metavar="N",
-        help="number of source positions (default: the number in the paper)",
+        help="number of source positions (default: the experiment's own)",
     )
-    add("--rt", metavar="S,S,…", help="reverberation times in seconds, such as 0,0.4, or a range such as 0:2:0.2")
-    add("--seed", type=argument.seed, default=0, help="random seed; the same seed gives the same results (default 0)")
-    add("--classes", default=",".join(CLASSES), help=f"classes of sounds to use (default {','.join(CLASSES)})")
+    add(
+        "--rt",
+        metavar="S,S,…",
+        help="reverberation times in seconds, such as 0,0.4, or a range such as 0:2:0.2 (default: the experiment's "
+        "own)",
+    )
+    add("--seed", type=argument.seed, default=0, help="random seed; the same seed gives the same results (default: 0)")
+    add("--classes", default=",".join(CLASSES), help=f"classes of sounds to use (default: {','.join(CLASSES)})")
     add(
         "--snr",
         metavar="DB[,DB…]",
@@ -99,34 +115,42 @@ def _add_simulation(group: Any) -> None:
         type=argument.positive,
         default=16000,
         metavar="HZ",
-        help="sampling rate in hertz (default 16000)",
+        help="sampling rate in hertz (default: 16000)",
     )
 
 
 def _add_localization(group: Any) -> None:
     add = group.add_argument
-    add("--grid", type=float, metavar="M", help="spacing of the search grid in metres (default: that of the paper)")
+    add("--grid", type=float, metavar="M", help="spacing of the search grid in metres (default: the experiment's own)")
     add(
         "--segment",
         choices=("longest", "peak"),
-        default="longest",
-        help="segment of each sound to locate: the longest, or the one with the peak (default longest)",
+        default=SEGMENT,
+        help="segment of each sound to locate: the longest, or `peak` for the one with the loudest frame (default: "
+        f"longest; not with {LOCALIZER})",
     )
     add(
         "--no-band-limit",
         action="store_true",
-        help="use the full band for all pairs, even if it causes spatial aliasing",
+        help="use the full band for all pairs of microphones, even if it causes spatial aliasing (not with "
+        f"{LOCALIZER})",
     )
 
 
 def _add_comparison(group: Any) -> None:
     add = group.add_argument
-    add("--half", choices=HALVES, default="test", help="half of the sounds to use (default test)")
+    add(
+        "--half",
+        choices=HALVES,
+        default=HALF,
+        help="half of the sounds to use: the constants of the methods were fitted on `development`, results are "
+        "reported on `test` (default: test)",
+    )
     add(
         "--scenario",
         default=ROOMS,
         metavar="NAME[,NAME…]",
-        help=f"one or more of {', '.join(SCENARIOS)}, compared on the same sounds and rooms (default {ROOMS}); "
+        help=f"one or more of {', '.join(SCENARIOS)}, compared on the same sounds and rooms (default: {ROOMS}); "
         f"or only one of {', '.join(ALONE)}",
     )
 
@@ -210,9 +234,8 @@ def evaluate(arguments: argparse.Namespace, jobs: int, show: Callable[[int, int]
             f"evaluate: expected the packages of the extra 'evaluate' ({error}); run pip install 'livessl[evaluate]'"
         ) from error
 
+    _refuse_unused(arguments)
     if arguments.experiment == REPORT:
-        if arguments.site is not None:
-            raise ValueError("evaluate report: runs nothing, so expected no --site; remove it")
         if not arguments.others:
             raise ValueError("evaluate report: expected one or more folders of results, got none; add --with DIR")
         return write_report(arguments.out, arguments.others)
@@ -227,6 +250,31 @@ def evaluate(arguments: argparse.Namespace, jobs: int, show: Callable[[int, int]
     clips = read_clips(arguments.events, classes, settings.sample_rate_hz)
     results = run_campaign(Job(settings, clips), arguments.out, jobs=jobs, scheduler=arguments.scheduler, progress=show)
     return [results, *write_report(arguments.out, [arguments.out, *arguments.others])]
+
+
+def _refuse_unused(arguments: argparse.Namespace) -> None:
+    """Refuse the options that have no effect on the experiment."""
+    of_paper = {
+        "--site": arguments.site,
+        "--segment": arguments.segment != SEGMENT,
+        "--no-band-limit": arguments.no_band_limit,
+    }
+    of_localizer = {"--half": arguments.half != HALF, "--scenario": arguments.scenario != ROOMS}
+    of_simulation = {
+        "--events": arguments.events,
+        "--positions": arguments.positions,
+        "--rt": arguments.rt,
+        "--snr": arguments.snr,
+        "--grid": arguments.grid,
+        "--scheduler": arguments.scheduler,
+    }
+    name, why = arguments.experiment, f"with {arguments.experiment}"
+    if name == REPORT:
+        refuse_unused("evaluate", of_paper | of_localizer | of_simulation, f"{why}, which simulates nothing")
+    elif name == LOCALIZER:
+        refuse_unused("evaluate", of_paper | {"--with": arguments.others}, why)
+    else:
+        refuse_unused("evaluate", of_localizer, why)
 
 
 def _run_localizer(arguments: argparse.Namespace, jobs: int, show: Callable[[int, int], None]) -> list[Path]:
@@ -266,6 +314,8 @@ def _localizer_settings(arguments: argparse.Namespace) -> Any:
             **common,
         )
     if names[0] in SESSIONS:
+        if arguments.grid is not None:
+            raise ValueError(f"--grid: {names[0]} takes the spacing of the search grid from its site; remove --grid")
         return sessions.SessionSettings(
             positions=arguments.positions or sessions.POSITIONS,
             scenario=names[0],

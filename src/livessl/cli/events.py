@@ -10,7 +10,7 @@ from livessl.cli import argument
 from livessl.cli.exits import OK
 from livessl.cli.options import add_json
 from livessl.cli.output import print_event, xyz
-from livessl.cli.server_answers import read_token
+from livessl.cli.server_answers import add_token_file, read_token
 
 if TYPE_CHECKING:
     from livessl.client import Received
@@ -25,7 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options."""
     add = parser.add_argument
     add("--url", default=URL, help=f"address of the server (default: {URL})")
-    add("--token-file", type=Path, metavar="FILE", help="file that holds a token, if the server requires one")
+    add_token_file(parser)
     add("--ca-file", type=Path, metavar="FILE", help="PEM file of the authority that signed the server's certificate")
     add(
         "--kinds",
@@ -34,19 +34,29 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="KIND,KIND,…",
         help=f"messages to print: {', '.join(KINDS)} (default: event)",
     )
-    add("--zone", help="print only what is inside this zone")
+    add(
+        "--zone",
+        metavar="NAME",
+        help="print only events, updates, tracks, changes and alerts inside this zone; other kinds are not affected",
+    )
     add(
         "--min-confidence",
         type=argument.probability,
         metavar="C",
         help="print only events and updates of at least this confidence, 0 to 1",
     )
-    add("--track", type=argument.count, metavar="N", help="of all tracks, print only number N")
+    add(
+        "--track",
+        type=argument.count,
+        metavar="N",
+        help="of all tracks and their changes in zones, print only those of track N; other kinds are not affected",
+    )
     add(
         "--max-rate",
         type=argument.above_zero,
         metavar="HZ",
-        help="print each sound, track and array at most HZ times a second",
+        help="print at most HZ updates of each sound a second, and as many states of each track and of the arrays; "
+        "events, alerts, changes in zones, and the first and last state of a track are always printed",
     )
     add("--since", type=_time, metavar="TIME", help="begin with the stored events from this time on (RFC 3339)")
     add("--limit", type=argument.positive, metavar="N", help="end after N messages")

@@ -16,7 +16,13 @@ from livessl.garbage import collect_seldom
 def add_arguments(parser: Any) -> None:
     """Describe the command's arguments."""
     parser.add_argument(
-        "--config", type=Path, required=True, help="the hub's settings (YAML); docs/scaling.md describes them"
+        "--config",
+        type=Path,
+        required=True,
+        metavar="FILE",
+        help="the hub's settings (YAML). `nats` and `database` are required, such as: "
+        '{nats: {servers: ["nats://127.0.0.1:4222"]}, database: hub.sqlite}. Further keys are `http` as in a site '
+        "file, `stream`, `retention_days` and `hub`, the hub's name",
     )
 
 

@@ -13,44 +13,77 @@ from livessl.site.draft_parts import SIZE_M
 def add_arguments(parser: Any) -> None:
     """Describe the command's arguments."""
     parser.add_argument(
-        "site", type=Path, nargs="?", default=Path("site.yaml"), help="file to write (default site.yaml)"
+        "site", type=Path, nargs="?", default=Path("site.yaml"), help="file to write (default: site.yaml)"
     )
-    parser.add_argument("--name", type=draft_arguments.name, help="name of the site (default lab)")
-    parser.add_argument("--room", type=draft_arguments.room, metavar="X,Y,Z", help="length, width and height, metres")
+    _add_room(parser)
+    _add_arrays(parser)
+    _add_interfaces(parser)
+    parser.add_argument(
+        "--yes", action="store_true", help="ask nothing; use the default of everything that is not given"
+    )
+    parser.add_argument("--force", action="store_true", help="replace a file that exists")
+    parser.add_argument(
+        "--drawing",
+        type=Path,
+        metavar="FILE",
+        help="instead of a site file, write a printable drawing (SVG) of the first array",
+    )
+
+
+def _add_room(parser: Any) -> None:
+    parser.add_argument("--name", type=draft_arguments.name, help="name of the site (default: lab)")
+    parser.add_argument(
+        "--room",
+        type=draft_arguments.room,
+        metavar="X,Y,Z",
+        help="length, width and height of the room in metres (default: 6,5,2.7)",
+    )
+    parser.add_argument(
+        "--temperature",
+        type=draft_arguments.finite,
+        metavar="C",
+        help="air temperature in degrees Celsius (default: 20)",
+    )
+
+
+def _add_arrays(parser: Any) -> None:
     parser.add_argument(
         "--array",
         action="append",
         type=draft_arguments.array,
         default=[],
         metavar="NAME=KIND[:SIZE[xCOUNT]][@X,Y,Z[@YAW]]",
-        help=f"array to add. KIND: {', '.join(SIZE_M)}; SIZE: edge, spacing or radius in metres; X,Y,Z: centre; YAW in "
-        "degrees; repeatable",
+        help=f"array to add; repeat the option for each array. KIND is {', '.join(list(SIZE_M)[:-1])} or "
+        f"{list(SIZE_M)[-1]}; SIZE is its edge, the spacing of a line or the radius of a circle, in metres; COUNT is "
+        "the number of microphones of a line or circle (default: 4); X,Y,Z is the array's centre in metres; YAW turns "
+        "it about the vertical axis, in degrees, counterclockwise seen from above. What is left out is proposed",
     )
-    parser.add_argument("--arrays", type=draft_arguments.array_count, metavar="N", help="number of arrays (default 2)")
+    parser.add_argument("--arrays", type=draft_arguments.array_count, metavar="N", help="number of arrays (default: 2)")
+
+
+def _add_interfaces(parser: Any) -> None:
     parser.add_argument(
         "--interface",
         action="append",
         default=[],
         metavar="NAME",
-        help="audio interface, given by a part of its name; repeatable, and each gets its own node",
+        help="audio interface, by its name or a part of it; repeat the option for each interface. Each interface gets "
+        "a node of its own (default: one that is connected, otherwise UMC1820)",
     )
-    parser.add_argument("--rate", type=argument.sample_rate, metavar="HZ", help="sampling rate (default: by interface)")
+    parser.add_argument(
+        "--rate",
+        type=argument.sample_rate,
+        metavar="HZ",
+        help="sampling rate in hertz (default: that of the interface)",
+    )
     parser.add_argument(
         "--channels",
         action="append",
         type=argument.channels,
         default=[],
         metavar="ARRAY=1,2,3,4",
-        help="inputs of an array's microphones, counted from 1 (default: one after the other)",
-    )
-    parser.add_argument("--temperature", type=draft_arguments.finite, metavar="C", help="degrees Celsius (default 20)")
-    parser.add_argument("--yes", action="store_true", help="ask nothing; take defaults for what is not given")
-    parser.add_argument("--force", action="store_true", help="replace a file that exists")
-    parser.add_argument(
-        "--drawing",
-        type=Path,
-        metavar="FILE",
-        help="instead of a site file, write a printable drawing (SVG) of the array",
+        help="inputs of the interface to which the microphones of ARRAY are connected, in the order of the "
+        "microphones, counted from 1; repeat the option for each array (default: the next free inputs, in order)",
     )
 
 

@@ -34,13 +34,15 @@ def add_arguments(parser: Any) -> None:
 
     sub = action("server", _server, "make the server's key pair", "server --site site.yaml")
     add_json(sub, ONE_OBJECT)
-    sub = action(
-        "node",
-        _node,
+    text, example = (
         "make a node's key pair (run this command on the node)",
         "node lab-pc --site site.yaml --server 4f8a…",
     )
-    sub.add_argument("name", help="name of the node in the site file; use `replay` for the key of `livessl replay`")
+    sub = action("node", _node, text, example)
+    sub.add_argument(
+        "name",
+        help="name of the node in the site file, or `replay` for the key with which `livessl replay --server` connects",
+    )
     sub.add_argument(
         "--server", type=argument.key, metavar="KEY", help="the server's public key, as `keys server` printed it"
     )
@@ -54,19 +56,18 @@ def add_arguments(parser: Any) -> None:
         "token", _token, "make an access token for a client", "token --site site.yaml --name wall --role viewer"
     )
     sub.add_argument("--name", required=True, help="name of the client, by which its token can be revoked")
-    sub.add_argument(
-        "--role",
-        choices=ROLES,
-        default="viewer",
-        help="what the client may do (default viewer)",
-    )
+    sub.add_argument("--role", choices=ROLES, default="viewer", help="what the client may do (default: viewer)")
     add_json(sub, ONE_OBJECT)
     sub = action(
         "revoke", _revoke, "remove the key of a node or the token of a client", "revoke --site site.yaml --token wall"
     )
     which = sub.add_mutually_exclusive_group(required=True)
-    which.add_argument("--node", metavar="NAME", help="node to remove")
-    which.add_argument("--token", metavar="NAME", help="client whose token to revoke")
+    which.add_argument(
+        "--node", metavar="NAME", help="node whose key to remove; restart a running server to disconnect it"
+    )
+    which.add_argument(
+        "--token", metavar="NAME", help="client whose token to revoke; a running server refuses it within a second"
+    )
     sub = action("list", _list, "list the nodes and clients that may connect", "list --site site.yaml")
     add_json(sub, ONE_OBJECT)
 

@@ -71,12 +71,12 @@ COMMANDS: Final = (
     ),
     Command(
         "evaluate",
-        "repeat the paper's experiments in simulated rooms",
+        "compare methods in simulated rooms, repeat a paper's experiments, or report on earlier results",
         "livessl evaluate one-array --events sounds/ --positions 10 --out evaluation/",
     ),
     Command(
         "bench",
-        "measure how fast this machine locates, or how much load a server on it carries",
+        "measure how fast this machine locates sounds, or with --live how much load a server on it carries",
         "livessl bench --live --arrays 64 --clients 20 --seconds 30",
     ),
     Command(
@@ -167,7 +167,10 @@ def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
     parser.add_argument("-V", "--version", action="version", version=f"livessl {__version__}")
     parser.add_argument("--verbose", action="store_true", help="log debug messages to stderr as well")
     parser.add_argument(
-        "--log", type=LogForm, choices=list(LogForm), help="form of the log lines (default: LIVESSL_LOG, or text)"
+        "--log",
+        type=LogForm,
+        choices=list(LogForm),
+        help=f"format of the log lines (default: the environment variable {VARIABLE}, otherwise text)",
     )
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     names = {command.name for command in COMMANDS}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
@@ -44,10 +44,38 @@ def add_calibration_file(parser: Any) -> None:
         nargs="?",
         const=BESIDE_THE_SITE,
         metavar="FILE",
-        help="store the result in FILE (default: the calibration file that the site file names, otherwise "
-        "calibration/SITE.yaml beside the site file)",
+        help="store the result in FILE; --write without FILE stores it in the calibration file that the site file "
+        "names, otherwise in calibration/SITE.yaml beside the site file (default: the result is only printed)",
     )
-    parser.add_argument("--undo", action="store_true", help="put back the file that --write has replaced")
+    parser.add_argument(
+        "--undo",
+        action="store_true",
+        help="measure nothing, and restore the calibration file that the last --write replaced; needs --site or "
+        "--write FILE",
+    )
+
+
+def refuse_unused(command: str, given: Mapping[str, object], why: str) -> None:
+    """Refuse options that would have no effect.
+
+    Parameters
+    ----------
+    command : str
+        Name of the command.
+    given : mapping of str to object
+        Value of each such option; one that is not given has a value that is false.
+    why : str
+        Reason, which follows "have no effect".
+
+    Raises
+    ------
+    UseError
+        If any of them is given.
+    """
+    names = [option for option, value in given.items() if value]
+    if names:
+        verb, cure = ("has", "it") if len(names) == 1 else ("have", "them")
+        raise UseError(f"{command}: {' and '.join(names)} {verb} no effect {why}; remove {cure}")
 
 
 def import_from_here() -> None:
@@ -85,7 +113,8 @@ def add_wav(parser: Any, text: str, *, hint: str = "", required: bool = False) -
         type=argument.assignment,
         default=[],
         metavar="ARRAY=FILE[,FILE…]",
-        help=f"{text}. ARRAY=a.wav,b.wav: one file per microphone, in order{hint and f'. {hint}'}",
+        help=f"{text}. If each microphone has a file of its own, name them in the order of the microphones: "
+        f"ARRAY=a.wav,b.wav{hint and f'. {hint}'}",
         required=required,
     )
     parser.add_argument(

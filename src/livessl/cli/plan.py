@@ -23,21 +23,21 @@ def add_arguments(parser: Any) -> None:
         type=argument.not_negative,
         default=0.7,
         metavar="S",
-        help="reverberation time, seconds; 0 is anechoic (default 0.7)",
+        help="reverberation time, seconds; 0 is anechoic (default: 0.7)",
     )
     parser.add_argument(
         "--height",
         type=argument.not_negative,
         metavar="M",
-        help="height of the sounds, metres (default 1.5, or the middle of a search volume that ends below 1.5 m)",
+        help="height of the sounds, metres (default: 1.5, or the middle of a search volume that ends below 1.5 m)",
     )
     parser.add_argument(
         "--calibration",
         type=argument.above_zero,
         default=CALIBRATION_M,
         metavar="M",
-        help="how exactly the positions of microphones are known, standard deviation in metres "
-        f"(default {CALIBRATION_M:g})",
+        help="standard deviation, in metres, of the errors of the microphones' positions in the site file, by which "
+        f"the predicted error grows (default: {CALIBRATION_M:g})",
     )
     add_json(parser, "print one JSON object")
     parser.add_argument(

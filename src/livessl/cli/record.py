@@ -22,12 +22,18 @@ def add_arguments(parser: Any) -> None:
     parser.add_argument("--node", required=True, help="name of the node in the site file")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="new folder for the session")
     parser.add_argument(
-        "--format", choices=("flac", "wav"), default="flac", help="24-bit FLAC or float WAV (default flac)"
+        "--format",
+        choices=("flac", "wav"),
+        default="flac",
+        help="format of the recordings: 24-bit FLAC, or WAV with floating-point samples (default: flac)",
     )
     parser.add_argument(
         "--duration", type=argument.above_zero, metavar="S", help="stop after S seconds (default: until Ctrl-C)"
     )
-    add_wav(parser, "record FILE in real time instead of using the device; repeat for each array of the node")
+    add_wav(
+        parser,
+        "record the sound of FILE, in real time, instead of the device; repeat the option for each array of the node",
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:

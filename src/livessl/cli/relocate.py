@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from livessl.cli import argument, progress
 from livessl.cli.exits import FAILED, OK
-from livessl.cli.options import add_joint, add_json, add_method, import_from_here, read_site
+from livessl.cli.options import add_joint, add_json, add_method, import_from_here, read_site, refuse_unused
 from livessl.cli.output import complain, xyz
 from livessl.cli.server_answers import add_server
 from livessl.errors import UseError
@@ -38,16 +38,21 @@ def add_arguments(parser: Any) -> None:
     """Describe the command's arguments."""
     add = parser.add_argument
     add("clips", type=Path, nargs="?", help="folder of clips (default: server.clips of the site file)")
-    parser.add_argument("--site", type=Path, help="site file; not with --url")
-    add_server(parser, "the server relocates its own events (operator token required; nothing is stored)")
+    parser.add_argument("--site", type=Path, help="site file of the clips; required without --url, not with it")
+    add_server(
+        parser,
+        "it locates its own events again, which requires an operator's token if it has tokens; the stored events do "
+        "not change",
+    )
     add_method(parser, "the method by which each event was located before")
     add_joint(parser)
     add(
         "--set-up",
         choices=("then", "now"),
         default="then",
-        help="poses and speed of sound: `then` = those used for the event; `now` = those of the site file and "
-        "calibration (with --url: of the server) (default: then)",
+        help="poses of the arrays and speed of sound by which events are located again: `then` takes those by which "
+        "the event was located before, `now` those of the site file and its calibration file, or with --url those "
+        "that are in force at the server (default: then)",
     )
     add("--since", type=argument.time, metavar="TIME", help="only events that began at TIME or later (RFC 3339)")
     add("--until", type=argument.time, metavar="TIME", help="only events that began at TIME or earlier (RFC 3339)")
@@ -149,6 +154,7 @@ def _in_folder(arguments: argparse.Namespace) -> Archive:
 
     if arguments.site is None:
         raise UseError("relocate: expected --site FILE or --url ADDRESS, got neither; give one")
+    refuse_unused("relocate", {"--token-file": arguments.token_file}, "without --url, because no server is asked")
     site = read_site(arguments)
     if arguments.method is not None and is_import_path(arguments.method):
         make_estimator(site, arguments.method)  # one error before all, instead of one for each event

@@ -13,7 +13,7 @@ from livessl.capture.node import send_session
 from livessl.cli import argument, progress
 from livessl.cli.exits import OK, stop_on_signal
 from livessl.cli.node_input import run_id
-from livessl.cli.options import add_joint, add_json, add_method, import_from_here, joints
+from livessl.cli.options import add_joint, add_json, add_method, import_from_here, joints, refuse_unused
 from livessl.cli.output import print_event
 from livessl.cli.serve import run_until_stopped
 from livessl.clock import PacedClock, SystemClock, UnpacedClock
@@ -37,25 +37,28 @@ def add_arguments(parser: Any) -> None:
     )
     parser.add_argument("--site", type=Path, help="site file (default: that of the first session)")
     parser.add_argument(
-        "--speed", type=argument.speed, default=1.0, help="speed as a multiple of real time, or 'max' (default 1)"
+        "--speed", type=argument.speed, default=1.0, help="speed as a multiple of real time, or 'max' (default: 1)"
     )
     parser.add_argument(
         "--server",
         type=argument.endpoint,
         metavar="ENDPOINT",
-        help="address for nodes of the running server that gets the session, such as tcp://127.0.0.1:5570 (default: a "
-        "server in this process)",
+        help="send the session to a running server; ENDPOINT is the address at which it receives nodes (server.bind), "
+        "such as tcp://127.0.0.1:5570 (default: run a server in this process)",
     )
     parser.add_argument(
         "--once", action="store_true", help="exit at the end of the session instead of keeping the dashboard running"
     )
-    add_json(parser)
-    add_method(parser)
+    add_json(parser, "print one JSON object per event (not with --server)")
+    add_method(parser, "the site's; not with --server")
     add_joint(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
+    if arguments.server is not None:
+        given = {"--json": arguments.json, "--method": arguments.method}
+        refuse_unused("replay", given, "with --server, because that server locates and publishes the events")
     import_from_here()
     sessions = [read_session(directory) for directory in arguments.directories]
     joint = joints(arguments)

@@ -43,8 +43,16 @@ class RefusedError(RunError):
 def add_server(parser: Any, text: str) -> None:
     """Add --url and --token-file."""
     parser.add_argument("--url", help=f"address of a running server, such as http://127.0.0.1:8000; {text}")
+    add_token_file(parser)
+
+
+def add_token_file(parser: Any) -> None:
+    """Add --token-file."""
     parser.add_argument(
-        "--token-file", type=Path, metavar="FILE", help="file with an access token, if the server requires one"
+        "--token-file",
+        type=Path,
+        metavar="FILE",
+        help="file that holds an access token for the server, if it requires one",
     )
 
 

@@ -22,14 +22,15 @@ def add_arguments(parser: Any) -> None:
         "--events",
         type=Path,
         metavar="DIR",
-        help="folder of WAV or FLAC sounds to place in the room (default: built-in sounds)",
+        help="folder of sound files, WAV or FLAC, to place in the room (default: built-in sounds); --count is the "
+        "number of sounds",
     )
     parser.add_argument(
         "--rt60",
         type=argument.rt60,
         default=0.7,
         metavar="S",
-        help=f"reverberation time in seconds, 0 to {argument.MAX_RT60_S:g} (default 0.7)",
+        help=f"reverberation time in seconds, 0 to {argument.MAX_RT60_S:g} (default: 0.7)",
     )
     parser.add_argument(
         "--out",
@@ -38,7 +39,7 @@ def add_arguments(parser: Any) -> None:
         metavar="DIR",
         help="folder for the session; it must be new, empty, or contain a simulated session, which is replaced",
     )
-    parser.add_argument("--count", type=argument.positive, default=8, help="number of sounds in the scene (default 8)")
+    parser.add_argument("--count", type=argument.positive, default=8, help="number of sounds in the scene (default: 8)")
     parser.add_argument(
         "--sample-rate",
         type=argument.sample_rate,
@@ -46,7 +47,7 @@ def add_arguments(parser: Any) -> None:
         help="sampling rate of the recordings (default: the rate of each node's device, otherwise 44100)",
     )
     parser.add_argument(
-        "--seed", type=argument.seed, default=0, help="random seed; the same seed gives the same session (default 0)"
+        "--seed", type=argument.seed, default=0, help="random seed; the same seed gives the same session (default: 0)"
     )
 
 

@@ -19,7 +19,8 @@ def add_truth(parser: Any) -> None:
         "--truth",
         type=Path,
         metavar="FILE",
-        help="truth.jsonl of a simulated session: the places and times of its sounds, instead of --at",
+        help="file truth.jsonl that `livessl simulate` wrote beside the session: it has the places and times of the "
+        "sounds, so that --at is not needed",
     )
 
 

@@ -84,8 +84,13 @@ def describe(contact: Contact, states: Mapping[str, str]) -> JsonObject:
 
 
 def _condition(contact: Contact, states: Mapping[str, str]) -> str:
-    """Return the condition of a site: `away` if nothing comes from it, else by its arrays as its own health has it."""
+    """Return the condition of a site: `away` if nothing comes from it, else by its arrays as its own health has it.
+
+    A site that has not named its arrays yet is starting; one whose arrays are all disabled is degraded.
+    """
     if contact.is_away:
         return "away"
     enabled = {state for state in states.values() if state != "disabled"}
+    if states and not enabled:
+        return "degraded"
     return "ok" if enabled == {"healthy"} else "starting" if enabled <= {"starting", "healthy"} else "degraded"

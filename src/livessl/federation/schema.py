@@ -16,8 +16,9 @@ SiteName = Annotated[str, Field(description="Name of the site.", examples=["lab"
 class SiteCondition(StrEnum):
     """Condition of a site.
 
-    `ok`: every enabled array is healthy. `starting`: some have not sent anything yet. `degraded`: an array does not
-    work. `away`: nothing has come from the site for 30 s.
+    `ok`: every enabled array is healthy. `starting`: an enabled array has not sent anything yet, and the others are
+    healthy. `degraded`: an enabled array does not work, or all arrays are disabled. `away`: nothing has come from the
+    site for 30 s.
     """
 
     OK = "ok"

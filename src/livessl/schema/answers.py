@@ -23,7 +23,8 @@ BandHz = Annotated[
 class HealthState(StrEnum):
     """Condition of the server.
 
-    `ok`: every enabled array is healthy. `starting`: some have not sent anything yet. `degraded`: `reasons` says why.
+    `ok`: every enabled array is healthy. `starting`: an enabled array has not sent anything yet, and the others are
+    healthy. `degraded`: `reasons` says why; a server whose arrays are all disabled is degraded.
     `overloaded`: sound arrives faster than the machine can locate it, and `load` says what is shed. `failed`: the
     server stops.
     """

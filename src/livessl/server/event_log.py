@@ -155,14 +155,14 @@ class EventLog:
         return self._store.backlog.unsaved
 
     @property
-    def unkept(self) -> int:
+    def discarded(self) -> int:
         """Events given up because the store did not take them."""
-        return self._store.backlog.unkept
+        return self._store.backlog.discarded
 
     @property
-    def unkept_others(self) -> int:
+    def discarded_others(self) -> int:
         """Entries of the journal, and messages for the hub, given up because the store did not take them."""
-        return self._store.backlog.unkept_others
+        return self._store.backlog.discarded_others
 
     def begin_live(self) -> Finalized:
         """Begin a live run where the last one stopped: restore its early events, and return how far it came."""

@@ -1,4 +1,7 @@
-"""Keeps the latest sounds with the delays that the arrays observed, from which set-ups are calibrated."""
+"""Keeps the latest sounds, each with the delays that every array observed between its microphones.
+
+Measuring the poses of the arrays, and finding faults of the set-up, begins with these delays.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,8 @@ from livessl.core.commission.observe import observe
 from livessl.core.types import Event, Observation
 
 KEPT: Final = 64
-"""Number of sounds that are kept. A calibration needs fewer: 12 claps, or 20 sounds at unknown places."""
+"""Number of sounds that are kept. A guided calibration ends after 12 claps; one with given places may have 64. A
+calibration by sounds at unknown places uses 20 by default."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,8 +27,9 @@ class HeardSound:
     number : int
         Number of the sound; later sounds have higher ones.
     event : Event
-        Final event of the sound, without `received`.
+        Final event of the sound. `received`, the sound itself, is left out.
     observations : tuple of Observation
+        What each array observed: the delays between its microphones.
     """
 
     number: int
@@ -40,7 +45,8 @@ class HeardSounds:
     Parameters
     ----------
     first : int
-        Number before that of the first sound.
+        The first sound has the number `first` + 1. The numbers of a later run of the server begin above those of an
+        earlier one, so that a client does not confuse them.
     """
 
     def __init__(self, first: int = 0) -> None:

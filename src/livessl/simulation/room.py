@@ -16,8 +16,9 @@ from livessl.core.types import Float32Array, FloatArray, IntArray
 OVERSAMPLING: Final = 8
 """Bins per sample of the time axis to which images are added; each image is shared by its two nearest bins.
 
-An image between two bins, at the fraction a of their distance D, has the error a(1-a)(2 pi f D)^2/2. The mean over a is
-removed with the droop; the rest has the RMS (2 pi f D)^2/(12 sqrt 5): 0.6 % at the Nyquist frequency, less below.
+Sharing lowers the amplitude at high frequencies (droop). At the frequency f, an image at the fraction a of the distance
+D (seconds) between two bins has the relative error a(1-a)(2 pi f D)^2/2. The mean over a is corrected at the end, by
+`decimation_gain`; the rest has the RMS (2 pi f D)^2/(12 sqrt 5): 0.6 % at the Nyquist frequency, less below.
 """
 
 SHELL_IMAGES: Final = 1 << 18
@@ -97,17 +98,18 @@ def impulse_responses(
     rt60s_s : sequence of R float
         Nominal reverberation times in seconds; 0 is the direct path alone.
     sample_rate_hz : float
-        The responses fade out from 0.9 of its half.
+        Hertz. The responses fade out from 0.9 of the Nyquist frequency, its half, upwards.
     c_m_s : float
         Speed of sound, m/s.
     duration_s : float or None
         Length in seconds; it contains every image that arrives within it. None takes the longest reverberation time,
         or the time across the room if that is longer.
     own_lengths : bool
-        Whether each response is zero after its own reverberation time (or the time across the room).
+        Whether each response is zero after its own reverberation time (or after the time across the room, if that is
+        longer).
     compiled : bool
         Whether the images are summed by compiled code: several times faster, and equal except for rounding. Needs
-        numba (the extra `evaluate`).
+        numba (the extra `fast`).
 
     Returns
     -------
@@ -122,8 +124,9 @@ def impulse_responses(
     Notes
     -----
     Allen & Berkley, Image method for efficiently simulating small-room acoustics, JASA 65(4), 1979, without their
-    high-pass: below 100 Hz, where images only ever add, the response rings longer than the time asked for. The lattice
-    is visited in shells of equal volume, so memory does not grow with the number of images.
+    high-pass: below about 100 Hz, where the images of late reflections add up in phase instead of cancelling, the
+    response rings longer than the nominal reverberation time. The images are visited in shells of equal volume, so
+    memory grows much more slowly than their number.
     """
     room_m, source, microphones = checked_positions(room_size_m, source_m, microphones_m)
     if not (np.isfinite(sample_rate_hz) and sample_rate_hz > 0):

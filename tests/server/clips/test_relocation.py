@@ -163,7 +163,7 @@ def test_clip_that_does_not_fit_says_why(tmp_path: Path) -> None:
     with pytest.raises(RelocationError, match="has 4 channels, and the site file has 3 microphones now; locate the"):
         relocate(fewer, folder, first, "onset", "then")
     (tmp_path / "clips" / first / "array-south.flac").write_bytes(b"fLaC")
-    with pytest.raises(RelocationError, match=r"array-south\.flac cannot be read: .*; delete it"):
+    with pytest.raises(RelocationError, match=r"array-south\.flac cannot be read: .*; restore the file"):
         relocate(site, folder, first, "onset", "then")
     (tmp_path / "clips" / first / "array-south.flac").unlink()
     with pytest.raises(NoClipError, match=r"its recording 'array-south\.flac' is gone"):
@@ -264,5 +264,5 @@ def test_sound_that_takes_too_much_memory_is_refused_before_it_is_read(
 def test_recording_of_other_channels_is_refused(copied: Path) -> None:
     event = events()[0].id
     soundfile.write(copied / event / "array-south.flac", np.zeros((RATE_HZ, 3)), RATE_HZ)
-    with pytest.raises(RelocationError, match=r"expected 4 channels, as clip\.json says, got 3; delete it"):
+    with pytest.raises(RelocationError, match=r"expected 4 channels, as clip\.json says, got 3; restore the file"):
         relocate(site_of(), ClipReader(copied), event, "onset", "then")

@@ -237,7 +237,8 @@ def _as_wav(event_id: str, path: Path) -> bytes:
     try:
         samples, rate_hz = soundfile.read(path, dtype="int32", always_2d=True)
     except (OSError, soundfile.SoundFileError) as error:
-        raise HTTPException(409, f"event {event_id!r}: {path.name} cannot be read: {error}; delete it") from error
+        cure = "restore the file from a copy; the other recordings of the event can be heard"
+        raise HTTPException(409, f"event {event_id!r}: {path.name} cannot be read: {error}; {cure}") from error
     made = io.BytesIO()
     soundfile.write(made, samples, rate_hz, format="WAV", subtype="PCM_24")
     return made.getvalue()

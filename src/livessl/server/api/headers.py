@@ -1,4 +1,7 @@
-"""Headers that protect pages, and those that let pages of other origins read and frame what the site file permits."""
+"""Adds the headers that protect pages, and lets pages of other origins read the REST API (CORS) or frame pages.
+
+`hosts.py` checks `Host` and `Origin`: which requests are addressed to this server, and which pages may open WebSockets.
+"""
 
 from __future__ import annotations
 
@@ -57,7 +60,7 @@ class SafeHeaders:
 
 
 def other_origins(app: ASGIApp, http: HttpConfig, shown: tuple[str, ...]) -> ASGIApp:
-    """ASGI middleware that lets pages of `allowed_origins` read the API with a token of theirs (CORS).
+    """ASGI middleware that lets pages of `allowed_origins` read the REST API with their own token (CORS).
 
     Parameters
     ----------
@@ -78,7 +81,7 @@ def other_origins(app: ASGIApp, http: HttpConfig, shown: tuple[str, ...]) -> ASG
 
 
 def _content_security_policy(page: str, ancestors: tuple[str, ...]) -> str:
-    """Return the policy of all pages; of scripts inside pages it admits that of the dashboard."""
+    """Return the content security policy of all pages; the only inline script it admits is the dashboard's."""
     scripts = re.findall(r"<script>(.*?)</script>", page, re.DOTALL)
     digests = (b64encode(sha256(script.encode()).digest()).decode() for script in scripts)
     admitted = " ".join(["'self'", *(f"'sha256-{digest}'" for digest in digests)])

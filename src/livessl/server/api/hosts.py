@@ -1,4 +1,7 @@
-"""The names that the server is reached under: which requests are meant for it, and which pages may open WebSockets."""
+"""Checks Host and Origin: which requests are addressed to this server, and which pages may open WebSockets.
+
+`headers.py` lets pages of other origins read the REST API (CORS).
+"""
 
 from __future__ import annotations
 
@@ -21,8 +24,9 @@ OTHER_HOST: Final = "a host name that is not the server's own"
 OTHER_PAGE: Final = "a page of another server"
 """Reasons of refusals, as metrics and the log name them."""
 
-MAX_SHOWN: Final = 40
-"""Longest part of a refused name that is repeated, in characters: a WebSocket's closing reason has 123 bytes in all."""
+MAX_SHOWN: Final = 32
+"""Longest part of a refused name that an answer repeats, in characters: with both cures, it fills the 123 bytes of a
+WebSocket's closing reason."""
 
 _OWN: Final = ("127.0.0.1", "localhost", "[::1]")
 _PORTS: Final = {"http": ":80", "https": ":443"}
@@ -30,7 +34,7 @@ _HOST: Final = re.compile(r"(\[[0-9a-f:.]+\]|[^:\[\]]+)(?::[0-9]*)?")
 
 
 class ServerNames:
-    """Names of the server: those of this machine, `host`, and the `trusted_hosts` of the site file."""
+    """Names of the server: 127.0.0.1, localhost, [::1], and the `host` and `trusted_hosts` of the site file."""
 
     def __init__(self, http: HttpConfig) -> None:
         self._names = frozenset({*_OWN, in_url(http.host).lower(), *http.trusted_hosts})
@@ -43,16 +47,19 @@ class ServerNames:
     def foreign(self, headers: Headers) -> str | None:
         """Return the name that a request is addressed to if it is not the server's own, otherwise None.
 
-        Behind a proxy that replaces the host there are two: the proxy's for the server, and the client's for the proxy.
+        Behind a proxy that replaces the host, a request has two host names: the name by which the proxy calls the
+        server (`Host`), and the name by which the client calls the proxy (`X-Forwarded-Host`). Both are checked.
         """
         hosts = headers.get("host", ""), public_host(headers)
         return next((host for host in hosts if not _matches(host, self._names)), None)
 
     def may_open(self, headers: Headers) -> bool:
-        """Return True if the page that opens a WebSocket is one of this server, or of `allowed_origins`.
+        """Return True if a client may open a WebSocket.
 
-        Browsers do not check that. A client that names no page is no browser. Behind a proxy that replaces the host,
-        only `X-Forwarded-Host` or `trusted_hosts` reveal the name that the browser uses.
+        The page that opens it must be of the host that the request is addressed to, of `trusted_hosts`, whatever its
+        port, or of `allowed_origins`. Browsers do not check that, but they send the page's `Origin`; a request without
+        `Origin` comes from another program and is accepted. Behind a proxy that replaces the host, only
+        `X-Forwarded-Host` or `trusted_hosts` reveal the name that the browser uses.
         """
         scheme, _, page = headers.get("origin", "").lower().partition("://")
         if "origin" not in headers or headers["origin"].lower() in self._origins:
@@ -98,13 +105,17 @@ class HostCheck:
 
 
 def other_page(headers: Headers) -> str:
-    """Return the reason that closes the WebSocket of another server's page; the dashboard shows it."""
+    """Return the reason that closes the WebSocket of another server's page; the dashboard shows it.
+
+    It names both cures, because the server cannot know whether the page is its own, loaded through a proxy.
+    """
     page = headers.get("origin", "").partition("://")[2] or headers.get("origin", "")
-    return f"origin: {page[:MAX_SHOWN]} is not this server; add it to server.http.trusted_hosts"
+    cure = "add it to server.http.trusted_hosts (proxy) or allowed_origins"
+    return f"origin: {page[:MAX_SHOWN]} is not this server; {cure}"
 
 
 def _matches(host: str, patterns: frozenset[str]) -> bool:
-    """Return True if a host, whatever its port, is one of the names or below one that begins with `*.`."""
+    """Return True if a host, whatever its port, is one of the names, or a subdomain of `x` if `*.x` is listed."""
     found = _HOST.fullmatch(host.lower())
     if found is None:
         return False

@@ -31,8 +31,8 @@ LISTEN: Final = "/api/v1/listen"
 SEND_TIMEOUT_S: Final = 30.0
 """A client that accepts no byte for this long, in seconds, is disconnected."""
 
-MAX_REASON: Final = 120
-"""Longest reason of a closing frame, in bytes; RFC 6455 allows 123."""
+MAX_REASON: Final = 123
+"""Longest reason of a closing frame, in bytes, that RFC 6455 allows."""
 
 POLICY_VIOLATION: Final = 1008
 """Close code of RFC 6455 for a request that the server refuses."""

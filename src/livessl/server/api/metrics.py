@@ -106,9 +106,9 @@ def event_metrics(parts: Parts) -> Iterator[Metric]:
     """Gauges and counters of events."""
     log = parts.event_log
     yield CounterMetricFamily("livessl_events", "Events published since the server started.", log.published)
-    yield CounterMetricFamily("livessl_events_unkept", "Events that could not be stored.", log.unkept)
+    yield CounterMetricFamily("livessl_events_unkept", "Events that could not be stored.", log.discarded)
     what = "Entries of the journal, and messages for the hub, that could not be stored."
-    yield CounterMetricFamily("livessl_entries_unkept", what, log.unkept_others)
+    yield CounterMetricFamily("livessl_entries_unkept", what, log.discarded_others)
     yield GaugeMetricFamily("livessl_events_unsaved", "Events that wait to be stored.", log.unsaved)
     stored = parts.store.count()
     if stored is not None:

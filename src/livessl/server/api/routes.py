@@ -31,6 +31,9 @@ from livessl.site.models import Site
 
 _log = logging.getLogger(__name__)
 
+NONE_ENABLED: Final = "all arrays are disabled, so nothing is located; enable one"
+"""Reason of `degraded` where an operator has disabled every array."""
+
 _DATE_TIME: Final = {"type": "string", "format": "date-time"}
 _BINARY: Final = {"schema": {"type": "string", "format": "binary"}}
 MAP_HEADERS: Final = {
@@ -49,7 +52,7 @@ Time = Annotated[str, WithJsonSchema(_DATE_TIME)]
 
 
 def as_json(found: JsonObject, status: int = 200) -> Response:
-    """An answer as JSON. The models in `schema/answers.py` describe it and are not run."""
+    """An answer as JSON. The models in `schema/` describe it in OpenAPI; it is not validated against them here."""
     return Response(orjson.dumps(found), status, media_type="application/json")
 
 
@@ -130,7 +133,7 @@ def _add_state(router: APIRouter, parts: Parts) -> None:
 
     @router.get("/api/v1/findings", tags=["state"], response_model=Findings)
     def get_findings() -> Response:
-        """Faults of the set-up that the last sounds show, errors first, and faults that they would not show."""
+        """Faults of the set-up that the last sounds show, errors first, and faults that they could not show."""
         state = parts.set_up_watch.state
         findings = [{"kind": "finding", **asdict(finding)} for finding in state.findings]
         blind_spots = [_blind_spot(spot) for spot in state.blind_spots]
@@ -178,19 +181,23 @@ def condition(parts: Parts, arrays: Sequence[JsonObject]) -> tuple[str, list[str
     """Return the status of the server, and the reasons for it."""
     reasons = [f"{a['name']}: {a['reason']}" for a in arrays if a["reason"] is not None]
     states = {a["state"] for a in arrays if a["enabled"]}  # an operator disables an array on purpose
-    status = "ok" if states == {"healthy"} else "starting" if states <= {"starting", "healthy"} else "degraded"
-    unkept = parts.event_log.unkept
-    unsaved = parts.event_log.unsaved if parts.store.backlog.is_failing else 0  # others are being written
-    if unkept:
-        reasons.append(f"server.events_db: {unkept} events were not stored; {parts.store.cure}")
-    if others := parts.event_log.unkept_others:
+    status = "ok" if states == {"healthy"} else "degraded" if not states <= {"starting", "healthy"} else "starting"
+    if not states:
+        status = "degraded"
+        reasons.append(NONE_ENABLED)
+    discarded = parts.event_log.discarded
+    # as long as writing succeeds, events that wait are about to be written, which is no fault
+    unsaved = parts.event_log.unsaved if parts.store.backlog.is_failing else 0
+    if discarded:
+        reasons.append(f"server.events_db: {discarded} events were not stored; {parts.store.cure}")
+    if others := parts.event_log.discarded_others:
         what = "entries of the journal or messages for the hub"
         reasons.append(f"server.events_db: {others} {what} were not stored; {parts.store.cure}")
     if unsaved:
         reasons.append(f"server.events_db: {unsaved} events wait to be stored; {parts.store.cure}")
     if parts.store.problem is not None:
         reasons.append(parts.store.problem)
-    if (unkept or others or unsaved or parts.store.problem) and status == "ok":
+    if (discarded or others or unsaved or parts.store.problem) and status == "ok":
         status = "degraded"
     problems = parts.alerts.problems + ([] if parts.clips is None else parts.clips.problems)
     if parts.hub_link is not None and parts.hub_link.problem is not None:

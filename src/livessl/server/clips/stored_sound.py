@@ -1,6 +1,7 @@
 """Reads from a clip what locating its event again needs, and words why an event cannot be located again.
 
-`reader` has checked what every clip says; what only locating again needs is checked here.
+`reader.py` has checked the fields of `clip.json` that every use of a clip needs. The fields that only locating again
+needs are checked here.
 """
 
 from __future__ import annotations
@@ -21,22 +22,29 @@ from livessl.server.clips.reader import ABOUT, Clip, ClipReader, UnreadableClipE
 
 MOST_BYTES: Final = 256_000_000
 """Most bytes of decoded samples that a server holds to locate one event again. A sound of 60 s, the longest event, at
-48 kHz from five arrays of four microphones takes 230 MB; a server whose memory is used up loses live sound."""
+48 kHz from five arrays of four microphones takes 230 MB. A server that runs out of memory loses live sound."""
 
 MOST_OFF_S: Final = 3600.0
-"""Largest distance, in seconds, between the event and a frame of its clip; the fusion steps through all frame indices
-between, so that one damaged index would never end."""
+"""Largest difference, in seconds, between the start of the event and a frame of its clip. The fusion steps through all
+frame indices between the first and the last, so a damaged index could keep it busy for ever."""
+
+# Limits of the numbers in a clip, at least as wide as those of a site file. A correlation is as long as the sound takes
+# across an array, so a damaged number could fill the memory.
 
 _SPEEDS_M_S: Final = (100.0, 2000.0)
+"""Lowest and highest speed of sound, m/s."""
+
 _RATES_HZ: Final = (100.0, 1e6)
+"""Lowest and highest sampling rate, Hz."""
+
 _MOST_M: Final = 1000.0
+"""Largest coordinate of a microphone, metres."""
+
 _MOST_UNCERTAINTY: Final = 100.0
-"""Limits of the speed of sound, the sampling rate, the coordinates of microphones, and of what they may be off by, as a
-site file has them or wider. Correlations are as long as the way across an array takes: a damaged number would make them
-fill the memory."""
+"""Largest value of each uncertainty, in its own unit."""
 
 _UNREADABLE: Final = (AttributeError, KeyError, OverflowError, TypeError, ValueError)
-"""Errors that reading arrays and frames of another form raises."""
+"""Errors that Python raises when the arrays and frames of a clip are read and have another form than expected."""
 
 
 class RelocationError(RunError):
@@ -75,7 +83,10 @@ class StoredArray:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the samples when they are decoded, as the frames hold them or as the recording does."""
+        """Bytes of the decoded samples: those of the recording or of all frames, whichever are more.
+
+        Frames of a damaged clip may overlap, and hold more samples than the recording.
+        """
         held = max(self.length, sum(row.length for row in self.rows))
         return held * len(self.microphones_m) * np.dtype(np.float32).itemsize
 
@@ -119,7 +130,7 @@ class StoredSound:
 
 
 def is_relocatable(clip: Clip) -> bool:
-    """Return whether a clip says of its frames what locating again needs."""
+    """Return whether a clip describes its frames, which locating again needs; clips of earlier releases do not."""
     return bool(clip.content.get("arrays"))
 
 
@@ -143,12 +154,13 @@ def stored_clip(folder: ClipReader, event_id: str) -> Clip:
 
 
 def stored_sound(clip: Clip) -> StoredSound:
-    """Return what an event's clip says of its sound; reads no file.
+    """Return the description of an event's sound in its clip; reads no file.
 
     Raises
     ------
     RelocationError
-        If an earlier or later release has made the clip, or it is damaged.
+        If the clip was made by an earlier release, which did not describe frames, or if a field is missing or has
+        another form than expected, as in a damaged clip or one of a later release.
     """
     if not is_relocatable(clip):
         raise RelocationError(
@@ -186,7 +198,7 @@ def stored_frames(sound: StoredSound, array: StoredArray) -> list[Frame]:
     NoClipError
         If the recording has been deleted meanwhile.
     RelocationError
-        If it cannot be read, or is another than `clip.json` describes.
+        If it cannot be read, or if its number of channels or its length differs from what `clip.json` states.
     """
     event_id, path = sound.event_id, sound.clip.file(array.file)
     if path is None:
@@ -194,7 +206,10 @@ def stored_frames(sound: StoredSound, array: StoredArray) -> list[Frame]:
     try:
         samples = _samples(path, array)
     except (OSError, soundfile.SoundFileError, ValueError) as error:
-        raise RelocationError(f"event {event_id!r}: {array.file} cannot be read: {error}; delete it") from error
+        raise RelocationError(
+            f"event {event_id!r}: {array.file} cannot be read: {error}; restore the file from a copy, or delete the "
+            "recordings of this event"
+        ) from error
     frames = []
     for number, row in enumerate(array.rows, 1):
         piece = np.ascontiguousarray(samples[:, row.begin : row.begin + row.length])

@@ -83,9 +83,9 @@ class Backlog:
         """True if the last attempt to write has failed."""
         self.unsaved = 0
         """Events that wait to be written."""
-        self.unkept = 0
+        self.discarded = 0
         """Events that were given up."""
-        self.unkept_others = 0
+        self.discarded_others = 0
         """Entries of the journal, and messages for the hub, that were given up."""
         self.failure: BaseException | None = None
         """The error that has ended the thread, if one has."""
@@ -221,5 +221,5 @@ class Backlog:
         return write
 
     def _give_up(self, write: Write) -> None:
-        self.unkept += write.events
-        self.unkept_others += write.others
+        self.discarded += write.events
+        self.discarded_others += write.others
