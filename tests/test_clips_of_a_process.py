@@ -42,7 +42,7 @@ def made(figures: dict[str, Any]) -> int:
     return sum(int(figures[name]) for name in ("written", "shed", "failed", "without_sound", "with_speech"))
 
 
-pytestmark = [pytest.mark.processes, pytest.mark.timeout(240)]
+pytestmark = pytest.mark.processes
 
 
 class ClipServer:

@@ -49,7 +49,7 @@ NEAR_M = 0.5
 LEAD_NS = 8_000_000_000
 """Time in which both nodes start, even on a busy machine; later ones would begin late."""
 
-pytestmark = [pytest.mark.processes, pytest.mark.timeout(240)]
+pytestmark = pytest.mark.processes
 
 
 @dataclass

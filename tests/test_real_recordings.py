@@ -13,7 +13,7 @@ import claps
 import recordings as r
 from livessl.cli.main import main
 
-pytestmark = [pytest.mark.recordings, pytest.mark.timeout(300)]
+pytestmark = pytest.mark.recordings
 
 
 def need(name: str) -> Path:

@@ -12,7 +12,7 @@ import pytest
 from killed_alerts import play_killed
 from processes import make_recordings
 
-pytestmark = [pytest.mark.processes, pytest.mark.timeout(280)]
+pytestmark = pytest.mark.processes
 
 KILLS = 2
 SOUNDS = 5

@@ -17,7 +17,7 @@ from livessl.server.array_states import WATCH_NS
 from livessl.server.engine import WAIT_S
 from small_site import HANG_S
 
-pytestmark = [pytest.mark.processes, pytest.mark.timeout(900)]
+pytestmark = pytest.mark.processes
 
 COUNT = 4
 

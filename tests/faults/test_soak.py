@@ -16,7 +16,7 @@ from soak import GROWTH, Outcome, soak
 from livessl.core.stream.final_pass import FinalResults, TwoPassFusion
 from livessl.core.types import Message, Output
 
-pytestmark = [pytest.mark.processes, pytest.mark.timeout(120)]
+pytestmark = pytest.mark.processes
 
 HOURS, REFERENCE_HOURS, SAMPLE_S = 0.25, 0.1, 180.0
 
