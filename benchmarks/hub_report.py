@@ -181,8 +181,10 @@ def _hour(run: Json) -> list[Block]:
         f"with {events} events in {run['took_s']:.0f} s, {taken} taken in at the end. "
         f"The stream grew to {run['stream_bytes'] / 1e6:.0f} MB {grown}"
     )
-    titles = ("until minute", "messages /s", "age of the oldest message that waits: median, 95 %, longest",
-              "largest backlog, messages", *PARTS.values(), "memory of the hub", "slowest kind of answer, 95 %")  # fmt: skip
+    titles = (
+        *("until minute", "messages /s", "age of the oldest message that waits: median, 95 %, longest"),
+        *("largest backlog, messages", *PARTS.values(), "memory of the hub", "slowest kind of answer, 95 %"),
+    )
     rows = []
     for part in run["parts"]:
         slowest = max(part["answers"], key=lambda kind: float(part["answers"][kind]["p95_ms"]))
@@ -235,8 +237,8 @@ def _of_a_site(loads: Sequence[Json]) -> str:
         f"hour, and {1 + len(ARRAYS)} more when it begins: its own first one and the first state of each array. These "
         f"messages take {_bytes_per_day(longest) / 1e6:.1f} MB of the stream and {stored / 1e6:.1f} MB of the "
         f"database a day (by the figures of {longest['sites']} sites). The processor times include the sites' reports "
-        f"on themselves: in the run of {load['sites']} sites, {reports:.1f} reports came with each message; at the pace "
-        f"of real time, {real:.1f} reports come with each message."
+        f"on themselves: in the run of {load['sites']} sites, {reports:.1f} reports came with each message; at the "
+        f"pace of real time, {real:.1f} reports come with each message."
     )
 
 

@@ -38,8 +38,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--zone",
         metavar="NAME",
-        help="print only events, updates, tracks, changes of tracks (kind zone) and alerts inside this zone; other kinds "
-        "are not affected",
+        help="print only events, updates, tracks, changes of tracks (kind zone) and alerts inside this zone; other "
+        "kinds are not affected",
     )
     add(
         "--min-confidence",
