@@ -162,7 +162,7 @@ def _add_comparison(group: Any) -> None:
         default=ROOMS,
         metavar="NAME[,NAME…]",
         help=f"one or more of {', '.join(SCENARIOS)}, compared on the same sounds and rooms (default: {ROOMS}); "
-        f"or only one of {', '.join(ALONE)}; docs/accuracy says what each compares",
+        f"or only one of {', '.join(ALONE)}; docs/accuracy/README.md has the results of each",
     )
 
 
