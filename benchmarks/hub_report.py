@@ -25,7 +25,12 @@ MANY: Final = 100_000_000
 """Stored events to which the fit of the answers is extended."""
 
 ANSWERS: Final = (
-    "95 % of the API's answers take at most, in ms (and in brackets the processor time of hub and database meanwhile)"
+    "95th percentile of the times of the API's answers, ms (in brackets that of the processor time of hub and database "
+    "meanwhile, ms)"
+)
+
+ROWS: Final = (
+    "`all sites` is `GET sites`, `metrics` is `GET /metrics`, and all other rows are searches by `GET events`."
 )
 
 Json = dict[str, Any]
@@ -58,21 +63,25 @@ def document(folder: Path) -> str:
         raise ValueError(f"{folder}: {what}")
     blocks: list[Block] = []
     if loads:
-        blocks += [_about(loads), _flood(loads), "Processor time and disk of that:", _costs(loads), *_limits(loads)]
+        blocks += [_about(loads), _flood(loads), "Processor time and disk space of these runs:", _costs(loads)]
+        blocks.append(_of_a_site(loads))
         paced = [load for load in loads if "paced" in load]
         if paced:
-            blocks += [f"At the pace of real time, or {MIN_PACE:.0f} messages a second if that is more:", _paced(paced)]
+            pace = f"At the pace of real time; at least {MIN_PACE:.0f} messages a second:"
+            blocks += [pace, _paced(paced), *_limits(loads)]
             blocks += [
-                f"{ANSWERS}, at the pace of real time:",
+                f"{ANSWERS}, at the pace of real time. {ROWS}",
                 _answers(paced, "sites"),
             ]
+        else:
+            blocks += _limits(loads)
     for hour in hours:
         blocks += _hour(hour)
     if histories:
         blocks += [
             _about(histories),
             _stored(histories),
-            f"{ANSWERS}:",
+            f"{ANSWERS}. {ROWS}",
             _answers(histories, "history"),
         ]
         blocks += _fit(histories)
@@ -95,7 +104,15 @@ def _about(runs: Sequence[Json]) -> str:
 
 
 def _flood(loads: Sequence[Json]) -> Table:
-    titles = ("sites", "arrays", "messages", "published /s", "taken in /s", "times real time", "most that waited")
+    titles = (
+        "sites",
+        "arrays",
+        "messages",
+        "published /s",
+        "taken in /s",
+        "speed (1 = real time)",
+        "largest backlog, messages",
+    )
     rows = [
         (
             *(f"{load['sites']}", f"{load['sites'] * len(ARRAYS)}", _messages(load)),
@@ -134,7 +151,7 @@ def _messages(load: Json) -> str:
 
 
 def _paced(loads: Sequence[Json]) -> Table:
-    titles = ("sites", "messages /s", "reports /s", "age of the oldest that waits: median, 95 %, longest",
+    titles = ("sites", "messages /s", "reports /s", "age of the oldest message that waits: median, 95 %, longest",
               *PARTS.values(), "most memory of the hub")  # fmt: skip
     rows = []
     for load in loads:
@@ -164,8 +181,10 @@ def _hour(run: Json) -> list[Block]:
         f"with {events} events in {run['took_s']:.0f} s, {taken} taken in at the end. "
         f"The stream grew to {run['stream_bytes'] / 1e6:.0f} MB {grown}"
     )
-    titles = ("until minute", "messages /s", "age of the oldest that waits: median, 95 %, longest", "most that waited",
-              *PARTS.values(), "memory of the hub", "slowest kind of answer, 95 %")  # fmt: skip
+    titles = (
+        *("until minute", "messages /s", "age of the oldest message that waits: median, 95 %, longest"),
+        *("largest backlog, messages", *PARTS.values(), "memory of the hub", "slowest kind of answer, 95 %"),
+    )
     rows = []
     for part in run["parts"]:
         slowest = max(part["answers"], key=lambda kind: float(part["answers"][kind]["p95_ms"]))
@@ -199,32 +218,46 @@ def _stored(runs: Sequence[Json]) -> str:
     )
 
 
+def _longest(loads: Sequence[Json]) -> Json:
+    """Return the run of the longest time, in which what sites send once counts least in the disk space."""
+    return max(loads, key=lambda each: (each["minutes"], each["sites"]))
+
+
+def _bytes_per_day(load: Json) -> float:
+    return float(24 * MESSAGES_PER_HOUR * load["stream_bytes_per_message"])
+
+
+def _of_a_site(loads: Sequence[Json]) -> str:
+    """Return what a site sends in an hour, and what that takes."""
+    load, longest = loads[-1], _longest(loads)
+    stored = 24 * EVENTS_PER_HOUR * longest["database_bytes_per_event"]
+    reports, real = load["sites"] / REPORT_S / load["taken_in_per_s"], 1 / REPORT_S / real_time_per_s(1)
+    return (
+        f"A site of {len(ARRAYS)} arrays with {EVENTS_PER_HOUR} events an hour sends {MESSAGES_PER_HOUR} messages an "
+        f"hour, and {1 + len(ARRAYS)} more when it begins: its own first one and the first state of each array. These "
+        f"messages take {_bytes_per_day(longest) / 1e6:.1f} MB of the stream and {stored / 1e6:.1f} MB of the "
+        f"database a day (by the figures of {longest['sites']} sites). The processor times include the sites' reports "
+        f"on themselves: in the run of {load['sites']} sites, {reports:.1f} reports came with each message; at the "
+        f"pace of real time, {real:.1f} reports come with each message."
+    )
+
+
 def _limits(loads: Sequence[Json]) -> list[Block]:
     """Return by what the number of sites is limited, the first limit first.
 
-    Processor time is that of the most sites, at the pace of real time if it was measured; disk is that of the longest
-    time, in which what sites send once counts least.
+    Processor time is that of the most sites, at the pace of real time if it was measured; disk is that of `_longest`.
     """
-    load, longest = loads[-1], max(loads, key=lambda each: (each["minutes"], each["sites"]))
+    load, longest = loads[-1], _longest(loads)
     sites, pace = load["sites"], real_time_per_s(load["sites"])
+    which = "at full speed"
     shares = {name: ms / 1000 * pace for name, ms in load["processor_ms_per_message"].items()}
     if "paced" in load and pace >= MIN_PACE:
-        shares = load["paced"]["processor_share"]
-    day = 24 * MESSAGES_PER_HOUR * longest["stream_bytes_per_message"]
-    stored = 24 * EVENTS_PER_HOUR * longest["database_bytes_per_event"]
+        shares, which = load["paced"]["processor_share"], "at the pace of real time"
     most = {f"a core for {PARTS[name]}": sites / share for name, share in shares.items() if share > 0}
-    most["what the hub took in here"] = load["taken_in_per_s"] / real_time_per_s(1)
-    most["the stream's 10 GB, to keep a day"] = STREAM_BYTES / day
+    most["the rate that the hub took in here"] = load["taken_in_per_s"] / real_time_per_s(1)
+    most["10 GB of stream that hold a day of messages"] = STREAM_BYTES / _bytes_per_day(longest)
     rows = [(name, f"{count:.0f}") for name, count in sorted(most.items(), key=lambda each: each[1])]
-    reports, real = sites / REPORT_S / load["taken_in_per_s"], 1 / REPORT_S / real_time_per_s(1)
-    costs = (
-        f"A site of {len(ARRAYS)} arrays with {EVENTS_PER_HOUR} events an hour sends {MESSAGES_PER_HOUR} messages an "
-        f"hour, which take {day / 1e6:.1f} MB of the stream and {stored / 1e6:.1f} MB of the database a day (by the "
-        f"figures of {longest['sites']} sites). The processor times include the sites' reports on themselves: in the "
-        f"run of {sites} sites, {reports:.1f} reports came with each message; at the pace of real time, {real:.1f} "
-        "reports come with each message."
-    )
-    return [costs, f"Limits, by the processor times of {sites} sites:", Table(("limit", "sites"), rows)]
+    return [f"Limits, extrapolated from {sites} sites {which}:", Table(("limit", "sites"), rows)]
 
 
 def _answers(runs: Sequence[Json], key: str) -> Table:

@@ -1,5 +1,6 @@
 #!/bin/sh
-# Installs or updates livessl on this machine with its systemd units, or rolls back to the release before:
+# Installs or updates livessl on this machine with its systemd units, takes an update back that does not stay up (how
+# long it waits: `restart`), or rolls back to the release before:
 #
 #   sh deploy/install.sh --server --node lab-pc       from a checkout; --wheel FILE or --version 0.3.0 from elsewhere
 #   sh deploy/install.sh --roll-back                  the release that ran before runs again

@@ -34,7 +34,7 @@ Run = Callable[..., Done]
 
 
 def simulate_arguments(site: Path, out: Path, seed: int = 5) -> list[str]:
-    options = f"--rt60 0 --count 2 --sample-rate {RATE_HZ} --seed {seed}".split()
+    options = f"--rt60 0 --count 2 --rate {RATE_HZ} --seed {seed}".split()
     return ["simulate", "--site", str(site), "--out", str(out), *options]
 
 

@@ -27,12 +27,12 @@ URL = "http://127.0.0.1:9"
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ("levels --device a --sample-rate 1e9", "expected a sampling rate from 100 to 1,000,000 Hz, got '1e9'"),
-        ("levels --device a --sample-rate nan", "expected a sampling rate from 100 to 1,000,000 Hz, got 'nan'"),
+        ("levels --device a --rate 1e9", "expected a sampling rate from 100 to 1,000,000 Hz, got '1e9'"),
+        ("levels --device a --rate nan", "expected a sampling rate from 100 to 1,000,000 Hz, got 'nan'"),
         ("init s.yaml --rate 1e300", "expected a sampling rate from 100 to 1,000,000 Hz, got '1e300'"),
         ("init s.yaml --arrays 65", "expected 1 to 64 arrays, got 65"),
         (f"init s.yaml --arrays {'9' * 5000}", f"expected a whole number >= 1, got '{'9' * 40}'…"),
-        ("simulate --site s.yaml --out d --sample-rate 1e12", "expected a sampling rate from 100 to 1,000,000 Hz"),
+        ("simulate --site s.yaml --out d --rate 1e12", "expected a sampling rate from 100 to 1,000,000 Hz"),
         ("simulate --site s.yaml --out d --seed -1", "expected a seed from 0 to 9223372036854775807, got '-1'"),
         ("simulate --site s.yaml --out d --count ²", "expected a whole number >= 1, got '²'"),
         ("simulate --site s.yaml --out d --count 1000000001", "expected a whole number >= 1, got '1000000001'"),
@@ -62,7 +62,7 @@ def test_number_with_thousands_of_zeros_before_it_is_a_number(run: Run) -> None:
 
 def test_rate_too_low_for_the_own_sounds_is_refused(run: Run, tmp_path: Path) -> None:
     out = tmp_path / "session"
-    done = run("simulate", "--site", write_site(tmp_path), "--out", out, "--sample-rate", 7999)
+    done = run("simulate", "--site", write_site(tmp_path), "--out", out, "--rate", 7999)
     assert done.code == 2
     assert "sampling rate: expected 8000 to 1e+06 Hz for the project's own sounds, got 7999" in done.err
     assert not out.exists()

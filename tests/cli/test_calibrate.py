@@ -25,7 +25,7 @@ def claps(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
     """Eight sounds in the small room; no test changes them."""
     directory = tmp_path_factory.mktemp("claps")
     site = write_site(tmp_path_factory.mktemp("site"))
-    options = f"--rt60 0.2 --count 8 --sample-rate {RATE_HZ} --seed 4".split()
+    options = f"--rt60 0.2 --count 8 --rate {RATE_HZ} --seed 4".split()
     assert main(["simulate", "--site", str(site), "--out", str(directory), *options]) == 0
     return Recorded(directory, site)
 

@@ -159,7 +159,7 @@ def test_sounds_that_the_server_keeps_refine_a_turned_array(
         finish(server, event)
     prompts = clapper(sounds[kept:])
     site = write_site(tmp_path, {"arrays.south.orientation_deg": {"yaw": 25.0}})
-    options = ["--site", site, "--url", server.url, "--sounds", str(count)]
+    options = ["--site", site, "--url", server.url, "--count", str(count)]
     done = run("calibrate", "refine", *options, "--known", "north", "--write", "--json")
     assert len(prompts) == count - kept
     (pose, speed) = done.objects
@@ -193,7 +193,7 @@ def test_sounds_that_one_array_received_do_not_count_for_refining(
     server.parts.set_up_watch.forget()
     finish(server, of_one_array(sounds[0], "north"))
     prompts = clapper(sounds)
-    options = ["--site", write_site(tmp_path), "--url", server.url, "--sounds", "10", "--known", "north"]
+    options = ["--site", write_site(tmp_path), "--url", server.url, "--count", "10", "--known", "north"]
     run("calibrate", "refine", *options, "--json")
     assert [prompt.partition(" place ")[2] for prompt in prompts] == [f"({n} of 10)" for n in range(10)]
 

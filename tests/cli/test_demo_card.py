@@ -23,7 +23,7 @@ def test_sounds_of_a_virtual_interface_are_located(run: Run) -> None:
     lack = virtual_interface.missing()
     require(lack is None, str(lack))
     for _ in range(TRIES):
-        done = run("demo", "--once", "--sound-card", "--events", str(EVENTS), "--port", str(free_port()), "--json")
+        done = run("demo", "--once", "--sound-card", "--count", str(EVENTS), "--port", str(free_port()), "--json")
         if done.code == 0:
             break
     assert done.code == 0, done.err

@@ -25,7 +25,7 @@ def ten_sounds(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
     """Ten sounds in the small room, with some reverberation; no test changes them."""
     directory = tmp_path_factory.mktemp("ten")
     site = write_site(tmp_path_factory.mktemp("site"))
-    options = f"--rt60 0.3 --count 10 --sample-rate {RATE_HZ} --seed 8".split()
+    options = f"--rt60 0.3 --count 10 --rate {RATE_HZ} --seed 8".split()
     assert main(["simulate", "--site", str(site), "--out", str(directory), *options]) == 0
     return Recorded(directory, site)
 

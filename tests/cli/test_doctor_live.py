@@ -13,6 +13,7 @@ import pytest
 from cli.command_runs import Run
 from livessl.capture.node import send_session
 from livessl.clock import SystemClock, UnpacedClock
+from livessl.core.commission.finding import LEAST_SOUNDS
 from livessl.core.types import Float32Array
 from livessl.recordings.assign import AssignedRecording
 from livessl.recordings.recording import MemoryRecording
@@ -65,6 +66,7 @@ def test_a_fault_makes_its_array_degraded_and_ends_when_it_is_mended(
     mended = httpx.get(f"{server.url}/api/v1/findings").json()
     Findings.model_validate_json(json.dumps(mended), strict=True)
     assert mended["findings"] == []
+    assert mended["least_sounds"] == LEAST_SOUNDS
     assert mended["blind_spots"]  # two arrays hide a shift along the line between them
     done = run("doctor", "--url", server.url)
     assert done.out == f"no fault found in {SOUNDS} sounds\n"

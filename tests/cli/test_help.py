@@ -6,6 +6,7 @@ import json
 import re
 import socket
 from dataclasses import asdict
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -15,7 +16,6 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from cli.command_runs import COMMANDS, Run, interrupted
 from livessl import __version__
 from livessl.capture.portaudio import InputDevice
-from livessl.cli import demo
 from livessl.cli.main import main
 from livessl.cli.parser import Parser
 from livessl.site.models import Site
@@ -43,12 +43,33 @@ def test_defaults_are_written_in_one_form(run: Run, command: str) -> None:
     assert "repeatable" not in shown
 
 
-def test_number_of_sounds_of_the_demo_has_the_name_that_it_has_elsewhere() -> None:
-    """`--events` is a folder in `simulate` and `evaluate`; in `demo` it stays as an older name of `--count`."""
-    for option in ("--count", "--events"):
-        parser = Parser()
-        demo.add_arguments(parser)
-        assert parser.parse_args([option, "3"]).count == 3
+@pytest.mark.parametrize(
+    ("command", "options"),
+    [
+        ("calibrate refine", "--count 3 | --sounds 3"),
+        ("demo", "--count 3 | --events 3"),
+        (
+            "evaluate localizer --out o",
+            "--sounds d --rt60 0,1 --rate 8000 --spacing 0.2 | --events d --rt 0,1 --sample-rate 8000 --grid 0.2",
+        ),
+        ("init s.yaml", "--rate 8000 | --sample-rate 8000"),
+        ("levels", "--rate 8000 | --sample-rate 8000"),
+        ("record --site s --node n --out o", "--seconds 3 | --duration 3"),
+        ("simulate --site s --out o", "--sounds d --rate 8000 | --events d --sample-rate 8000"),
+    ],
+)
+def test_older_names_of_options_work_and_are_hidden(run: Run, command: str, options: str) -> None:
+    """One thing has one name in all commands: `--sounds` is a folder, `--count` a number of sounds."""
+    name = command.partition(" ")[0]
+    parser = Parser()
+    import_module(f"livessl.cli.{name}").add_arguments(parser)
+    parsed = [vars(parser.parse_args([*command.split()[1:], *half.split()])) for half in options.split(" | ")]
+    assert parsed[0] == parsed[1]
+    given = re.findall(r"--\S+", options)
+    shown = run(*command.split()[: 2 if name == "calibrate" else 1], "--help").out
+    current, older = given[: len(given) // 2], given[len(given) // 2 :]
+    assert all(re.search(rf"{option}\b", shown) for option in current)
+    assert not any(re.search(rf"{option}\b", shown) for option in older)
 
 
 def test_help_lists_the_commands(run: Run) -> None:
@@ -86,7 +107,7 @@ def test_version_is_printed(run: Run) -> None:
         ("replay d --server tcp://127.0.0.1:*", "expected tcp://HOST:PORT or ipc://PATH, got 'tcp://127.0.0.1:*'"),
         ("capture --site s.yaml --node n --start-at noon", "expected RFC 3339 with an offset"),
         ("capture --site s.yaml --node n --start-at 2026-01-01T00:00:00", "expected RFC 3339 with an offset"),
-        ("record --site s.yaml --node n --out d --duration 0", "expected a number > 0, got '0'"),
+        ("record --site s.yaml --node n --out d --seconds 0", "expected a number > 0, got '0'"),
         ("record --site s.yaml --node n --out d --format mp3", "invalid choice: 'mp3'"),
         ("simulate --site s.yaml --out d --rt60 -1", "expected seconds from 0 to 5, got '-1'"),
         ("simulate --site s.yaml --out d --count 0", "expected a whole number >= 1, got '0'"),

@@ -192,7 +192,7 @@ def test_device_that_opens_although_no_search_finds_it_is_metered(
 ) -> None:
     monkeypatch.setattr("livessl.capture.input_search.search_input", lambda wanted: None)
     monkeypatch.setattr("livessl.capture.sound_device.SoundDevice", Delivering)
-    done = run("levels", "--device", "UMC1820", "--sample-rate", "8000", "--seconds", "0.5", "--json", *options)
+    done = run("levels", "--device", "UMC1820", "--rate", "8000", "--seconds", "0.5", "--json", *options)
     assert done.code == 0
     found = [json.loads(line) for line in done.out.splitlines()]
     assert [each["input"] for each in found if each["kind"] == "summary"] == list(range(1, inputs + 1))
@@ -273,7 +273,7 @@ def test_file_is_metered_at_once(run: Run, tmp_path: Path) -> None:
         ("--device a --wav b.wav", "expected one of --device, --site with --node, or --wav, got --device and --wav"),
         ("--site s.yaml", "--node: expected --site and --node together"),
         ("--device a --node n", "--node: expected --site and --node together"),
-        ("--wav b.wav --sample-rate 8000", "--sample-rate: applies to --device only"),
+        ("--wav b.wav --rate 8000", "--rate: applies to --device only"),
         ("--wav b.wav --inputs 4", "--inputs: applies to a device only"),
         ("--device a --out x.wav", "--out: needs --listen; add --listen CH, or remove --out"),
         ("--wav missing.wav", "missing.wav: expected a WAV or FLAC file, cannot read it: no such file"),

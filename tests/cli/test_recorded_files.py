@@ -316,7 +316,7 @@ def test_simulated_session_has_the_rates_of_the_site(
 
 def test_rate_on_the_command_line_wins(tmp_path: Path) -> None:
     site, out = write_site(tmp_path), tmp_path / "session"
-    made = here("simulate", "--site", site, "--rt60", 0, "--count", 1, "--sample-rate", 24000, "--out", out)
+    made = here("simulate", "--site", site, "--rt60", 0, "--count", 1, "--rate", 24000, "--out", out)
     assert made.returncode == 0
     assert soundfile.info(out / "south.wav").samplerate == 24000
 

@@ -37,8 +37,8 @@ def test_simulate_twice_gives_the_same_bytes(run: Run, recorded: Recorded, tmp_p
     ("options", "message"),
     [
         (["--rt60", "0.01"], "0.01"),
-        (["--events", "{empty}"], "expected WAV or FLAC files, got none"),
-        (["--events", "{empty}/nowhere"], "expected WAV or FLAC files, got none"),
+        (["--sounds", "{empty}"], "expected WAV or FLAC files, got none"),
+        (["--sounds", "{empty}/nowhere"], "expected WAV or FLAC files, got none"),
     ],
 )
 def test_impossible_simulation_is_an_error(
@@ -85,7 +85,7 @@ def test_server_with_live_nodes_refuses_a_replay(run: Run, recorded: Recorded) -
 def test_files_are_recorded_as_a_session(run: Run, recorded: Recorded, tmp_path: Path) -> None:
     out = tmp_path / "session"
     begun_ns = SystemClock().now_ns()
-    arguments = ["record", "--site", recorded.site, "--node", "lab-pc", "--out", out, "--duration", "0.4"]
+    arguments = ["record", "--site", recorded.site, "--node", "lab-pc", "--out", out, "--seconds", "0.4"]
     assert run(*arguments, *recorded.wavs()).code == 0
     session = read_session(out)
     assert {piece.array for piece in session.pieces} == {"north", "south"}
@@ -157,7 +157,7 @@ def test_session_is_replayed_to_this_machine_unless_a_site_says_otherwise(
 ) -> None:
     there = {"server.http": {"host": "0.0.0.0", "port": 8001, "tokens": "tokens.yaml"}, "keys": "keys"}
     path, session = write_site(tmp_path, there), tmp_path / "session"
-    made = ["simulate", "--site", str(path), "--rt60", "0", "--count", "1", "--sample-rate", str(RATE_HZ)]
+    made = ["simulate", "--site", str(path), "--rt60", "0", "--count", "1", "--rate", str(RATE_HZ)]
     assert main([*made, "--out", str(session)]) == 0
 
     def refuse(site: Site, *_: object, **__: object) -> None:

@@ -83,7 +83,7 @@ def test_options_without_effect_are_refused(run: Run, tmp_path: Path) -> None:
     assert (done.code, "no answer from a server" in done.err) == (1, True)
 
 
-LOCALIZER = "evaluate localizer --out results --events sounds"
+LOCALIZER = "evaluate localizer --out results --sounds sounds"
 
 
 @pytest.mark.parametrize(
@@ -98,10 +98,10 @@ LOCALIZER = "evaluate localizer --out results --events sounds"
         (f"{LOCALIZER} --with earlier", "evaluate: --with has no effect with localizer; remove it"),
         (f"{LOCALIZER} --segment peak --no-band-limit", "evaluate: --segment and --no-band-limit have no effect"),
         (
-            "evaluate office --out results --events sounds --half development",
+            "evaluate office --out results --sounds sounds --half development",
             "--half has no effect with office; remove",
         ),
-        ("evaluate report --out r --with e --events s", "--events has no effect with report, which simulates nothing;"),
+        ("evaluate report --out r --with e --sounds s", "--sounds has no effect with report, which simulates nothing;"),
         ("bench --arrays 8 --spin", "bench: --arrays and --spin have no effect without --live; remove them"),
         ("relocate clips --site site.yaml --token-file token", "relocate: --token-file has no effect without --url"),
         ("doctor --session session --token-file token", "doctor: --token-file has no effect without --url"),

@@ -119,7 +119,7 @@ def test_one_site_is_measured_from_the_stream_to_the_answers(tmp_path: Path) -> 
     (tmp_path / "sites-1.json").write_text(json.dumps({**ABOUT, **found}))
     said = document(tmp_path)
     assert f"| 1 | 8 | {found['messages']} of 60 min | " in said
-    assert "Limits, by the processor times of 1 sites:" in said
+    assert "Limits, extrapolated from 1 sites at full speed:" in said
 
 
 ABOUT: dict[str, Any] = {
@@ -161,7 +161,11 @@ def test_tables_name_the_limit_that_comes_first(tmp_path: Path) -> None:
         (tmp_path / f"sites-{sites}.json").write_text(json.dumps(load(sites)))
     said = document(tmp_path)
     # half a core for 1000 sites; 191 messages an hour: 10 GB / (24 x 191 x 1000 bytes), 2000 / s x 3600 s / 191
-    limits = ["the hub | 2000 |", "the stream's 10 GB, to keep a day | 2182 |", "what the hub took in here | 37696 |"]
+    limits = [
+        "the hub | 2000 |",
+        "10 GB of stream that hold a day of messages | 2182 |",
+        "the rate that the hub took in here | 37696 |",
+    ]
     places = [said.index(limit) for limit in limits]
     assert places == sorted(places)
     assert "0.1 reports came with each message; at the pace of real time, 3.8 reports come with each" in said

@@ -201,7 +201,7 @@ def test_link_local_address_with_its_interface(folder: Path) -> None:
 
 def test_session_is_replayed_to_a_server(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     session = tmp_path / "session"
-    made = f"--rt60 0 --count 2 --sample-rate {RATE_HZ} --seed 5".split()
+    made = f"--rt60 0 --count 2 --rate {RATE_HZ} --seed 5".split()
     assert main(["simulate", "--site", str(write_site(tmp_path)), "--out", str(session), *made]) == 0
     with running_server(site_of(on("::1"))) as server:
         assert main(["replay", str(session), "--server", server.endpoint, "--speed", "max"]) == 0

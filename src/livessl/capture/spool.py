@@ -1,9 +1,8 @@
 """Buffers a node's frames, in memory or in files, until the server needs them no more; drops the oldest if it is full.
 
-The order of sending is decided in `outbox`.
+The limits of size and age are `SpoolConfig` in `site/node_models.py`; the order of sending is decided in `outbox`.
 
-The limits of size and age are settings: `livessl.site.node_models.SpoolConfig` has the keys and their defaults. On
-disk, the spool is a folder of segments, which are only appended to. A segment is a magic number followed by records:
+On disk, the spool is a folder of segments, which are only appended to. A segment is a magic number followed by records:
 length and CRC-32 of a message, little-endian, and the message as it goes over the wire. A record that was half written
 when the node was killed ends its segment. A segment is deleted when none of its frames is needed any more.
 """

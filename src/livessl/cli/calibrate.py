@@ -20,7 +20,7 @@ from livessl.cli.calibration_words import (
 )
 from livessl.cli.doctor import add_recordings, finding_line, recordings_given
 from livessl.cli.exits import FAILED, OK
-from livessl.cli.options import add_calibration_file, add_json, read_site
+from livessl.cli.options import add_calibration_file, add_json, add_older_name, read_site
 from livessl.cli.output import complain, print_warnings
 from livessl.cli.server_answers import add_server
 from livessl.cli.truth_file import add_truth, truth_given
@@ -40,7 +40,7 @@ POSITION_STD_M: Final = 0.1
 """Default of --position-std, metres."""
 
 REFINED_SOUNDS: Final = 20
-"""Default of --sounds."""
+"""Default of --count."""
 
 
 def add_arguments(parser: Any) -> None:
@@ -93,9 +93,9 @@ def _add_refine(actions: Any) -> None:
         actions,
         "refine",
         _refine,
-        "use sounds at unknown places to measure the arrays' poses; one array's pose must be right",
+        "measure the arrays' poses by sounds at unknown places, relative to an array whose pose is right (--known)",
         "refine --site site.yaml --known north --write",
-        "uses the sounds that the server still keeps, and prompts for those that are missing",
+        "uses the sounds that the server still keeps, and prompts for more until there are --count",
     )
     sub.add_argument(
         "--known",
@@ -113,14 +113,15 @@ def _add_refine(actions: Any) -> None:
         help="standard deviation, in metres, of the errors of the arrays' positions in the site file "
         f"(default: {POSITION_STD_M:g}, as measured by tape)",
     )
-    sub.add_argument(
-        "--sounds",
+    count = sub.add_argument(
+        "--count",
         type=argument.positive,
         default=REFINED_SOUNDS,
         metavar="N",
-        help="number of sounds to use with a running server; those that it still keeps count "
+        help="number of sounds to use with a running server, including those that it still keeps "
         f"(default: {REFINED_SOUNDS})",
     )
+    add_older_name(sub, "--sounds", count)
     add_calibration_file(sub)
     add_json(sub, "print one JSON object for each array and the speed of sound")
 
@@ -141,7 +142,9 @@ def _action(
         epilog=f"example: livessl calibrate {example}",
     )
     sub.set_defaults(act=act)
-    add_recordings(sub, "site file (default: the session's); without recordings, the server that runs with it is used")
+    add_recordings(
+        sub, "site file (default: the session's); without recordings, the running server of this site file is used"
+    )
     add_server(sub, f"the command then {prompts}")
     sub.add_argument(
         "--wait",
@@ -347,7 +350,7 @@ def _refine(arguments: argparse.Namespace) -> int:
         site, server = _server(arguments)
         if len(site.processed) < 2:
             raise UseError(f"calibrate refine: expected two arrays or more, got {len(site.processed)}")
-        sounds = _kept_and_new(server, arguments.sounds)
+        sounds = _kept_and_new(server, arguments.count)
     else:
         site, sounds, parts = _recorded(arguments)
     names = [spec.name for spec in site.processed]

@@ -23,13 +23,13 @@ def add_arguments(parser: Any) -> None:
         parser,
         "use the sound of FILE, in real time, instead of the device; repeat the option for each array of the node",
     )
-    parser.add_argument("--loop", action="store_true", help="repeat the files until Ctrl-C")
+    parser.add_argument("--loop", action="store_true", help="if files are played: repeat them until Ctrl-C")
     parser.add_argument(
         "--start-at",
         type=argument.time,
         metavar="TIME",
-        help="time stamp of the files' first sample, RFC 3339 (default: now, or the next multiple of 5 s if the "
-        "site has several nodes, so that all start together)",
+        help="if files are played: time stamp of their first sample, RFC 3339 (default: now, or the next multiple of "
+        "5 s if the site has several nodes, so that all start together)",
     )
 
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from livessl.cli import argument, progress
 from livessl.cli.exits import FAILED, OK
-from livessl.cli.options import add_json
+from livessl.cli.options import add_json, add_older_name
 from livessl.cli.output import xyz
 from livessl.clock import SystemClock
 
@@ -38,15 +38,10 @@ def add_arguments(parser: Any) -> None:
     parser.add_argument("--once", action="store_true", help="run the scene once without opening a browser, and exit")
     add_json(parser)
     parser.add_argument("--port", type=int, default=8000, help="port of the dashboard (default: 8000)")
-    parser.add_argument(
-        "--count",
-        "--events",
-        dest="count",
-        type=argument.positive,
-        default=8,
-        metavar="N",
-        help="number of sounds in the scene; --events is an older name of --count (default: 8)",
+    count = parser.add_argument(
+        "--count", type=argument.positive, default=8, metavar="N", help="number of sounds in the scene (default: 8)"
     )
+    add_older_name(parser, "--events", count)
     parser.add_argument(
         "--sound-card",
         action="store_true",

@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from livessl.cli import argument, progress
 from livessl.cli.exits import OK, WRONG_USE
-from livessl.cli.options import add_json, refuse_unused
+from livessl.cli.options import add_json, add_older_name, refuse_unused
 from livessl.cli.output import complain
 from livessl.lab.evaluate.layout import layout_of
 from livessl.lab.evaluate.paper import CLASSES, EXPERIMENTS, Settings, experiment_of
@@ -44,21 +44,23 @@ def add_arguments(parser: Any) -> None:
     add(
         "experiment",
         choices=[*sorted(EXPERIMENTS), LOCALIZER, REPORT],
-        help=f"{', '.join(sorted(EXPERIMENTS))} repeat experiments of the paper ({PAPER}); {LOCALIZER} compares the "
-        f"methods onset and srp-phat; {REPORT} simulates nothing: it writes one report on the results of earlier runs "
-        "of the paper's experiments, in the folders given by --with",
+        help=f"experiments of the paper ({PAPER}): one-array (a small or a large array, at many "
+        "reverberation times), diversity (two small arrays at several distances, compared with one) and office (the "
+        f"same in an office); {LOCALIZER} compares the methods onset and srp-phat; {REPORT} simulates nothing: it "
+        "writes one report on the results of earlier runs of the paper's experiments, in the folders given by --with",
     )
     add(
         "--site",
         type=Path,
         help="site file whose room and arrays replace those of the paper (only with one-array and diversity)",
     )
-    add(
-        "--events",
+    sounds = add(
+        "--sounds",
         type=Path,
         metavar="DIR",
         help="folder of sound files, WAV or FLAC, each named by class and number, such as doorslam001.wav",
     )
+    add_older_name(parser, "--events", sounds)
     add(
         "--out",
         type=Path,
@@ -96,32 +98,41 @@ def _add_simulation(group: Any) -> None:
         metavar="N",
         help="number of source positions (default: the experiment's own)",
     )
-    add(
-        "--rt",
+    rt60 = add(
+        "--rt60",
         metavar="S,S,…",
         help="reverberation times in seconds, such as 0,0.4, or a range such as 0:2:0.2 (default: the experiment's "
         "own)",
     )
+    add_older_name(group, "--rt", rt60)
     add("--seed", type=argument.seed, default=0, help="random seed; the same seed gives the same results (default: 0)")
     add("--classes", default=",".join(CLASSES), help=f"classes of sounds to use (default: {','.join(CLASSES)})")
     add(
         "--snr",
         metavar="DB[,DB…]",
-        help="signal-to-noise ratio in dB: mean power of each recording over that of white sensor noise; inf adds no "
-        f"noise (default: inf); only {LOCALIZER} accepts several values",
+        help="white sensor noise to add, as signal-to-noise ratio in dB (mean power of the recording over that of the "
+        f"noise); inf adds none; only {LOCALIZER} accepts several values (default: inf)",
     )
-    add(
-        "--sample-rate",
+    rate = add(
+        "--rate",
+        dest="sample_rate",
         type=argument.positive,
         default=16000,
         metavar="HZ",
         help="sampling rate in hertz (default: 16000)",
     )
+    add_older_name(group, "--sample-rate", rate)
 
 
 def _add_localization(group: Any) -> None:
     add = group.add_argument
-    add("--grid", type=float, metavar="M", help="spacing of the search grid in metres (default: the experiment's own)")
+    spacing = add(
+        "--spacing",
+        type=float,
+        metavar="M",
+        help="spacing of the search grid in metres (default: the experiment's own)",
+    )
+    add_older_name(group, "--grid", spacing)
     add(
         "--segment",
         choices=("longest", "peak"),
@@ -151,7 +162,7 @@ def _add_comparison(group: Any) -> None:
         default=ROOMS,
         metavar="NAME[,NAME…]",
         help=f"one or more of {', '.join(SCENARIOS)}, compared on the same sounds and rooms (default: {ROOMS}); "
-        f"or only one of {', '.join(ALONE)}",
+        f"or only one of {', '.join(ALONE)}; docs/accuracy/README.md has the results of each",
     )
 
 
@@ -183,16 +194,16 @@ def settings_of(arguments: argparse.Namespace) -> Settings:
     """
     layout = None if arguments.site is None else layout_of(load_site(arguments.site))
     experiment = experiment_of(arguments.experiment, layout)
-    rt60s_s = experiment.rt60s_s if arguments.rt is None else reverberation_times_s(arguments.rt)
+    rt60s_s = experiment.rt60s_s if arguments.rt60 is None else reverberation_times_s(arguments.rt60)
     from livessl.simulation.room import absorption
 
     for rt60_s in rt60s_s:
         absorption(rt60_s, experiment.room_m, experiment.c_m_s)
-    if arguments.grid is not None and not 0.02 <= arguments.grid <= 2.0:
-        raise ValueError(f"--grid: expected 0.02 to 2 metres, got {arguments.grid:g}")
+    if arguments.spacing is not None and not 0.02 <= arguments.spacing <= 2.0:
+        raise ValueError(f"--spacing: expected 0.02 to 2 metres, got {arguments.spacing:g}")
     if arguments.sample_rate < experiment.lag_rate_hz:
         raise ValueError(
-            f"--sample-rate: the band ends at {experiment.band_hz[1]:g} Hz, expected "
+            f"--rate: the band ends at {experiment.band_hz[1]:g} Hz, expected "
             f"{math.ceil(experiment.lag_rate_hz)} Hz or more, got {arguments.sample_rate}"
         )
     return Settings(
@@ -201,7 +212,7 @@ def settings_of(arguments: argparse.Namespace) -> Settings:
         rt60s_s=rt60s_s,
         seed=arguments.seed,
         sample_rate_hz=float(arguments.sample_rate),
-        spacing_m=arguments.grid or experiment.spacing_m,
+        spacing_m=arguments.spacing or experiment.spacing_m,
         snr_db=_one_level_db(arguments.snr),
         segment=arguments.segment,
         band_limit=not arguments.no_band_limit,
@@ -239,15 +250,15 @@ def evaluate(arguments: argparse.Namespace, jobs: int, show: Callable[[int, int]
         if not arguments.others:
             raise ValueError("evaluate report: expected one or more folders of results, got none; add --with DIR")
         return write_report(arguments.out, arguments.others)
-    if arguments.events is None:
-        raise ValueError("evaluate: expected sounds to play, got none; add --events DIR")
+    if arguments.sounds is None:
+        raise ValueError("evaluate: expected sounds to play, got none; add --sounds DIR")
     if arguments.experiment == LOCALIZER:
         return _run_localizer(arguments, jobs, show)
     for folder in arguments.others:
         require_campaign(folder)  # before hours of computation
     settings = settings_of(arguments)
     classes = [name.strip() for name in arguments.classes.split(",") if name.strip()]
-    clips = read_clips(arguments.events, classes, settings.sample_rate_hz)
+    clips = read_clips(arguments.sounds, classes, settings.sample_rate_hz)
     results = run_campaign(Job(settings, clips), arguments.out, jobs=jobs, scheduler=arguments.scheduler, progress=show)
     return [results, *write_report(arguments.out, [arguments.out, *arguments.others])]
 
@@ -261,11 +272,11 @@ def _refuse_unused(arguments: argparse.Namespace) -> None:
     }
     of_localizer = {"--half": arguments.half != HALF, "--scenario": arguments.scenario != ROOMS}
     of_simulation = {
-        "--events": arguments.events,
+        "--sounds": arguments.sounds,
         "--positions": arguments.positions,
-        "--rt": arguments.rt,
+        "--rt60": arguments.rt60,
         "--snr": arguments.snr,
-        "--grid": arguments.grid,
+        "--spacing": arguments.spacing,
         "--scheduler": arguments.scheduler,
     }
     name, why = arguments.experiment, f"with {arguments.experiment}"
@@ -288,7 +299,7 @@ def _run_localizer(arguments: argparse.Namespace, jobs: int, show: Callable[[int
 
     settings = _localizer_settings(arguments)
     classes = [name.strip() for name in arguments.classes.split(",") if name.strip()]
-    clips = read_clips(arguments.events, classes, settings.sample_rate_hz)
+    clips = read_clips(arguments.sounds, classes, settings.sample_rate_hz)
     job = Job(settings, clips)
     results = run_campaign(job, arguments.out, jobs=jobs, scheduler=arguments.scheduler, progress=show)
     reports = {SessionSettings: write_sessions_report, NoiseSettings: write_noise_report}
@@ -301,21 +312,23 @@ def _localizer_settings(arguments: argparse.Namespace) -> Any:
     from livessl.lab.evaluate import localizer, noise, sessions
 
     names = _scenarios(arguments.scenario)
-    rt60s_s = None if arguments.rt is None else reverberation_times_s(arguments.rt)
+    rt60s_s = None if arguments.rt60 is None else reverberation_times_s(arguments.rt60)
     snrs_db = None if arguments.snr is None else levels_db(arguments.snr)
     common = {"seed": arguments.seed, "sample_rate_hz": float(arguments.sample_rate), "half": arguments.half}
     if names[0] == NOISE:
         if rt60s_s is not None:
-            raise ValueError(f"--rt: the rooms of {NOISE} have reverberation times of their own; remove --rt")
+            raise ValueError(f"--rt60: the rooms of {NOISE} have reverberation times of their own; remove --rt60")
         return noise.NoiseSettings(
             positions=arguments.positions or noise.POSITIONS,
             snrs_db=snrs_db or noise.SNRS_DB,
-            spacing_m=arguments.grid or localizer.SPACING_M,
+            spacing_m=arguments.spacing or localizer.SPACING_M,
             **common,
         )
     if names[0] in SESSIONS:
-        if arguments.grid is not None:
-            raise ValueError(f"--grid: {names[0]} takes the spacing of the search grid from its site; remove --grid")
+        if arguments.spacing is not None:
+            raise ValueError(
+                f"--spacing: {names[0]} takes the spacing of the search grid from its site; remove --spacing"
+            )
         return sessions.SessionSettings(
             positions=arguments.positions or sessions.POSITIONS,
             scenario=names[0],
@@ -327,7 +340,7 @@ def _localizer_settings(arguments: argparse.Namespace) -> Any:
         positions=arguments.positions or localizer.POSITIONS,
         rt60s_s=rt60s_s or localizer.RT60S_S,
         snrs_db=snrs_db or localizer.SNRS_DB,
-        spacing_m=arguments.grid or localizer.SPACING_M,
+        spacing_m=arguments.spacing or localizer.SPACING_M,
         scenarios=names,
         **common,
     )
@@ -351,7 +364,7 @@ def reverberation_times_s(text: str) -> tuple[float, ...]:
         if not times or not all(0.0 <= time < 60.0 for time in times):
             raise ValueError
     except (ValueError, ZeroDivisionError, OverflowError):
-        raise ValueError(f"--rt: expected seconds such as 0,0.4,0.8 or 0:2:0.2, got {text!r}") from None
+        raise ValueError(f"--rt60: expected seconds such as 0,0.4,0.8 or 0:2:0.2, got {text!r}") from None
     return tuple(sorted(set(times)))
 
 

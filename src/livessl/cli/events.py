@@ -32,12 +32,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=_kinds,
         default=("event",),
         metavar="KIND,KIND,…",
-        help=f"messages to print: {', '.join(KINDS)} (default: event)",
+        help=f"messages to print: {', '.join(KINDS)}; arrays: their states have changed; zone: a track has entered or "
+        "left a zone or loiters there; zones: the zones have changed; poses: other poses are in force (default: event)",
     )
     add(
         "--zone",
         metavar="NAME",
-        help="print only events, updates, tracks, changes and alerts inside this zone; other kinds are not affected",
+        help="print only events, updates, tracks, changes of tracks (kind zone) and alerts inside this zone; other "
+        "kinds are not affected",
     )
     add(
         "--min-confidence",
@@ -55,8 +57,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--max-rate",
         type=argument.above_zero,
         metavar="HZ",
-        help="print at most HZ updates of each sound a second, and as many states of each track and of the arrays; "
-        "events, alerts, changes in zones, and the first and last state of a track are always printed",
+        help="print at most HZ updates a second for each sound; the same limit holds for each track and for the "
+        "arrays. Events, alerts, changes in zones, and the first and last state of a track are always printed",
     )
     add("--since", type=_time, metavar="TIME", help="begin with the stored events from this time on (RFC 3339)")
     add("--limit", type=argument.positive, metavar="N", help="end after N messages")

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from livessl.cli import argument, draft_arguments
+from livessl.cli.options import add_older_name
 from livessl.site.draft_parts import SIZE_M
 
 
@@ -70,12 +71,13 @@ def _add_interfaces(parser: Any) -> None:
         help="audio interface, by its name or a part of it; repeat the option for each interface. Each interface gets "
         "a node of its own (default: one that is connected, otherwise UMC1820)",
     )
-    parser.add_argument(
+    rate = parser.add_argument(
         "--rate",
         type=argument.sample_rate,
         metavar="HZ",
         help="sampling rate in hertz (default: that of the interface)",
     )
+    add_older_name(parser, "--sample-rate", rate)
     parser.add_argument(
         "--channels",
         action="append",

@@ -56,7 +56,13 @@ def add_arguments(parser: Any) -> None:
         "token", _token, "make an access token for a client", "token --site site.yaml --name wall --role viewer"
     )
     sub.add_argument("--name", required=True, help="name of the client, by which its token can be revoked")
-    sub.add_argument("--role", choices=ROLES, default="viewer", help="what the client may do (default: viewer)")
+    sub.add_argument(
+        "--role",
+        choices=ROLES,
+        default="viewer",
+        help="viewer: read everything except sound, clients and log; operator: also listen, and change arrays, zones, "
+        "rules and poses; admin: also read clients, refused callers and the log (default: viewer)",
+    )
     add_json(sub, ONE_OBJECT)
     sub = action(
         "revoke", _revoke, "remove the key of a node or the token of a client", "revoke --site site.yaml --token wall"

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from livessl.cli import argument
-from livessl.cli.options import add_json
+from livessl.cli.options import add_json, add_older_name
 from livessl.errors import ConfigError, Fault
 
 if TYPE_CHECKING:
@@ -25,9 +25,14 @@ def add_arguments(parser: Any) -> None:
     parser.add_argument(
         "--inputs", type=argument.positive, metavar="N", help="number of inputs (default: all that the device has)"
     )
-    parser.add_argument(
-        "--sample-rate", type=argument.sample_rate, metavar="HZ", help="sampling rate with --device (default: its own)"
+    rate = parser.add_argument(
+        "--rate",
+        dest="sample_rate",
+        type=argument.sample_rate,
+        metavar="HZ",
+        help="sampling rate with --device (default: its own)",
     )
+    add_older_name(parser, "--sample-rate", rate)
     parser.add_argument("--seconds", type=argument.above_zero, metavar="N", help="end after N s (default: at Ctrl-C)")
     parser.add_argument("--tap", action="store_true", help="report which microphone you tap")
     parser.add_argument(
@@ -68,7 +73,7 @@ def _check(arguments: argparse.Namespace) -> Site | None:
     if (arguments.node is None) != (arguments.site is None):
         faults.append(Fault("--node", "expected --site and --node together; add the other one, or use --device"))
     if arguments.sample_rate is not None and arguments.device is None:
-        faults.append(Fault("--sample-rate", "applies to --device only; remove it"))
+        faults.append(Fault("--rate", "applies to --device only; remove it"))
     if arguments.inputs is not None and arguments.wav is not None:
         faults.append(Fault("--inputs", "applies to a device only; remove it"))
     if arguments.out is not None and arguments.listen is None:

@@ -72,7 +72,7 @@ COMMANDS: Final = (
     Command(
         "evaluate",
         "compare methods in simulated rooms, repeat a paper's experiments, or report on earlier results",
-        "livessl evaluate one-array --events sounds/ --positions 10 --out evaluation/",
+        "livessl evaluate one-array --sounds sounds/ --positions 10 --out evaluation/",
     ),
     Command(
         "bench",

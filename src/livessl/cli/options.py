@@ -1,4 +1,4 @@
-"""Options that several commands share: --site, --method, --wav, --channels, --joint, --json and --write."""
+"""Options that several commands share: --site, --method, --wav, --channels, --joint, --json, --write; older names."""
 
 from __future__ import annotations
 
@@ -24,6 +24,18 @@ BESIDE_THE_SITE: Final = Path()
 def add_site(parser: Any) -> None:
     """Add --site."""
     parser.add_argument("--site", type=Path, required=True, help="site file")
+
+
+def add_older_name(parser: Any, name: str, option: argparse.Action) -> None:
+    """Accept an option by an older name as well, which the help does not show."""
+    parser.add_argument(
+        name,
+        dest=option.dest,
+        type=option.type,
+        default=argparse.SUPPRESS,
+        help=argparse.SUPPRESS,
+        metavar=option.metavar,
+    )
 
 
 def add_method(parser: Any, default: str = "the site's") -> None:
@@ -113,7 +125,7 @@ def add_wav(parser: Any, text: str, *, hint: str = "", required: bool = False) -
         type=argument.assignment,
         default=[],
         metavar="ARRAY=FILE[,FILE…]",
-        help=f"{text}. If each microphone has a file of its own, name them in the order of the microphones: "
+        help=f"{text}. If each microphone has a file of its own, name the files in the order of the microphones: "
         f"ARRAY=a.wav,b.wav{hint and f'. {hint}'}",
         required=required,
     )

@@ -9,7 +9,7 @@ from typing import Any
 
 from livessl.cli import argument, progress
 from livessl.cli.exits import FAILED, OK, stop_on_signal
-from livessl.cli.options import add_site, add_wav
+from livessl.cli.options import add_older_name, add_site, add_wav
 from livessl.cli.output import complain
 from livessl.cli.own_work import refuse_foreign
 from livessl.clock import SystemClock
@@ -27,9 +27,10 @@ def add_arguments(parser: Any) -> None:
         default="flac",
         help="format of the recordings: 24-bit FLAC, or WAV with floating-point samples (default: flac)",
     )
-    parser.add_argument(
-        "--duration", type=argument.above_zero, metavar="S", help="stop after S seconds (default: until Ctrl-C)"
+    seconds = parser.add_argument(
+        "--seconds", type=argument.above_zero, metavar="N", help="stop after N s (default: at Ctrl-C)"
     )
+    add_older_name(parser, "--duration", seconds)
     add_wav(
         parser,
         "record the sound of FILE, in real time, instead of the device; repeat the option for each array of the node",
@@ -55,7 +56,7 @@ def run(arguments: argparse.Namespace) -> int:
     _refuse_to_overwrite(arguments.out, arguments.site)
     clock = SystemClock()
     begun_ns, begun = clock.now_ns(), clock.monotonic_ns()
-    length_ns = None if arguments.duration is None else round(arguments.duration * 1e9)
+    length_ns = None if arguments.seconds is None else round(arguments.seconds * 1e9)
     end_ns = None if length_ns is None else begun_ns + length_ns
     with stop_on_signal() as stop, progress.timed("recording", begun_ns, end_ns) as bar:
 

@@ -38,11 +38,13 @@ def add_arguments(parser: Any) -> None:
     """Describe the command's arguments."""
     add = parser.add_argument
     add("clips", type=Path, nargs="?", help="folder of clips (default: server.clips of the site file)")
-    parser.add_argument("--site", type=Path, help="site file of the clips; required without --url, not with it")
+    parser.add_argument(
+        "--site", type=Path, help="site file of the clips; required, unless --url is given, which excludes it"
+    )
     add_server(
         parser,
-        "it locates its own events again, which requires an operator's token if it has tokens; the stored events do "
-        "not change",
+        "the server locates its own stored events again; if the server has tokens, give an operator's. The stored "
+        "events do not change",
     )
     add_method(parser, "the method by which each event was located before")
     add_joint(parser)
@@ -50,9 +52,8 @@ def add_arguments(parser: Any) -> None:
         "--set-up",
         choices=("then", "now"),
         default="then",
-        help="poses of the arrays and speed of sound by which events are located again: `then` takes those by which "
-        "the event was located before, `now` those of the site file and its calibration file, or with --url those "
-        "that are in force at the server (default: then)",
+        help="`then`: poses and speed of sound with which the event was located at the time; `now`: those of the site "
+        "file and its calibration file (with --url: those in force at the server) (default: then)",
     )
     add("--since", type=argument.time, metavar="TIME", help="only events that began at TIME or later (RFC 3339)")
     add("--until", type=argument.time, metavar="TIME", help="only events that began at TIME or earlier (RFC 3339)")

@@ -9,7 +9,7 @@ from typing import Any
 
 from livessl.cli import argument, progress
 from livessl.cli.exits import OK, WRONG_USE
-from livessl.cli.options import add_site, make_folder
+from livessl.cli.options import add_older_name, add_site, make_folder
 from livessl.cli.output import complain
 from livessl.cli.own_work import refuse_foreign
 from livessl.errors import ConfigError, Fault
@@ -18,13 +18,14 @@ from livessl.errors import ConfigError, Fault
 def add_arguments(parser: Any) -> None:
     """Describe the command's arguments."""
     add_site(parser)
-    parser.add_argument(
-        "--events",
+    sounds = parser.add_argument(
+        "--sounds",
         type=Path,
         metavar="DIR",
         help="folder of sound files, WAV or FLAC, to place in the room (default: built-in sounds); --count is the "
         "number of sounds",
     )
+    add_older_name(parser, "--events", sounds)
     parser.add_argument(
         "--rt60",
         type=argument.rt60,
@@ -40,12 +41,14 @@ def add_arguments(parser: Any) -> None:
         help="folder for the session; it must be new, empty, or contain a simulated session, which is replaced",
     )
     parser.add_argument("--count", type=argument.positive, default=8, help="number of sounds in the scene (default: 8)")
-    parser.add_argument(
-        "--sample-rate",
+    rate = parser.add_argument(
+        "--rate",
+        dest="sample_rate",
         type=argument.sample_rate,
         metavar="HZ",
         help="sampling rate of the recordings (default: the rate of each node's device, otherwise 44100)",
     )
+    add_older_name(parser, "--sample-rate", rate)
     parser.add_argument(
         "--seed", type=argument.seed, default=0, help="random seed; the same seed gives the same session (default: 0)"
     )
@@ -68,7 +71,7 @@ def run(arguments: argparse.Namespace) -> int:
     rates = {} if arguments.sample_rate else device_rates_hz(site)
     rate = float(arguments.sample_rate or max(rates.values(), default=DEFAULT_RATE_HZ))
     try:
-        sounds = read_sounds(arguments.events, rate) if arguments.events else None
+        sounds = read_sounds(arguments.sounds, rate) if arguments.sounds else None
         scene = scene_of(
             site,
             rt60_s=arguments.rt60,

@@ -19,8 +19,8 @@ def add_truth(parser: Any) -> None:
         "--truth",
         type=Path,
         metavar="FILE",
-        help="file truth.jsonl that `livessl simulate` wrote beside the session: it has the places and times of the "
-        "sounds, so that --at is not needed",
+        help="file truth.jsonl that `livessl simulate` wrote into the folder of the session: it has the places and "
+        "times of the sounds, so that --at is not needed",
     )
 
 

@@ -1,4 +1,4 @@
-"""The hub's own file: its keys with their defaults, and the reading of it, with all faults at once."""
+"""The hub's own file: its keys and defaults (port, retention, limits of the stream); reports all faults at once."""
 
 from __future__ import annotations
 

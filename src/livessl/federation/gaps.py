@@ -1,4 +1,4 @@
-"""Measures how long a message of a site has been missing at the hub, before the hub gives it up."""
+"""Measures how long a message of a site has been missing at the hub; `intake` decides when it is given up."""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
 """Takes the sites' messages out of NATS into the hub's archive; of several hubs one does it, and another takes over.
 
-The consumer is durable and shared: what one hub took and did not acknowledge, the stream gives to the next one.
+It decides how long a missing message is awaited (`PATIENCE_S`). The consumer is durable and shared: what one hub took
+and did not acknowledge, the stream gives to the next one.
 """
 
 from __future__ import annotations

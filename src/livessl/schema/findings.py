@@ -80,10 +80,16 @@ class BlindSpot(Model):
 class Findings(Versioned):
     """Faults of the set-up that the last sounds show, errors first, and faults that they would not show."""
 
-    sounds: int = Field(ge=0, description="Number of sounds that were examined; three are the least.", examples=[12])
+    sounds: int = Field(ge=0, description="Number of sounds that were examined.", examples=[12])
+    least_sounds: int = Field(
+        default=0,  # of a server that is older than the field
+        ge=0,
+        description="Fewest sounds from which delays are judged, so that poses and the order of channels are examined.",
+        examples=[3],
+    )
     findings: list[Finding]
     blind_spots: list[BlindSpot] = Field(
         default=[],  # of a server that is older than the field
-        description="What these sounds cannot show about poses. Empty with fewer than three sounds of two arrays, and "
-        "while a finding is about poses: then sizes would not hold.",
+        description="What these sounds cannot show about poses. Empty with fewer than `least_sounds` sounds of two "
+        "arrays, and while a finding is about poses: then sizes would not hold.",
     )

@@ -1,4 +1,4 @@
-"""Reports the states of the arrays to API and log, and decides which arrays are disabled by an operator.
+"""Reports the states of the arrays to API and log, and keeps which arrays an operator has disabled.
 
 `ArrayHealth.state` decides a state; this module passes on what the nodes and the operator report.
 """

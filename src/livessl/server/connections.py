@@ -1,6 +1,6 @@
-"""Limits HTTP connections: how many there may be, and how long a slow client may take (time-outs).
+"""Limits HTTP connections: closes those beyond the most, and decides how long a slow client may take (time-outs).
 
-Sizes of requests are limited in `http` and `api/auth.py`.
+The most connections, and sizes of requests, are limits in `http` and `api/auth.py`.
 """
 
 from __future__ import annotations

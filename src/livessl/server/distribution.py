@@ -1,4 +1,7 @@
-"""Decides which messages the hub, the journal and the alerts get besides the subscribers, and what of a replay."""
+"""Hands messages on to subscribers, hub, journal and alerts, and decides what of a replay these do not get.
+
+Of what is handed on, `forwarding/hub_messages.py` and `journal.py` choose what they keep.
+"""
 
 from __future__ import annotations
 

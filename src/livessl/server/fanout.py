@@ -1,4 +1,4 @@
-"""Fans numbered messages out to subscribers: filters, rate limits, and what a slow client misses (`gap`)."""
+"""Fans numbered messages out to subscribers: filters, rate limits, how many wait for a slow client, and its `gap`."""
 
 from __future__ import annotations
 

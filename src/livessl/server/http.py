@@ -1,4 +1,4 @@
-"""HTTP below the routes: listening socket, TLS certificate and ciphers, most connections, longest head."""
+"""HTTP below the routes: listening socket, TLS certificate and ciphers, most connections of clients, longest head."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Decides which changes go into the journal: alerts, tracks that ended, changes of arrays and of the configuration.
+"""Makes the entries of the journal: alerts, tracks that ended, changes of the configuration and of arrays' states.
 
 Its table is in `history/journal.py`, its route in `api/journal_routes.py`.
 

@@ -1,7 +1,6 @@
-"""Measures the load of the server, words an overload, and sheds work.
+"""Measures the load of the server, and words an overload; `core/stream/load_policy.py` decides what is shed.
 
-The fusion thread measures its own delay in every turn, one pass of its loop, and `core.stream.load_policy` decides
-which work is shed. Every thread may read the figures.
+The fusion thread measures its own delay in every turn, one pass of its loop. Every thread may read the figures.
 """
 
 from __future__ import annotations
@@ -52,7 +51,7 @@ class _Figures(NamedTuple):
 
 
 class Overload:
-    """Measures the delay of the fusion, and decides which work is shed.
+    """Measures the delay of the fusion, and keeps which work is shed.
 
     Only the fusion thread may call `note`.
 

@@ -29,17 +29,19 @@ if TYPE_CHECKING:
     from livessl.core.commission.resection import MeasuredSetUp
 
 KEPT: Final = 16
-"""Number of proposals of people that can still be accepted, and of those of the thread; the oldest ones are dropped."""
+"""Number of proposals that are kept and can still be accepted: so many that people requested, and as many of
+`pose_refiner`. The oldest are dropped."""
 
 MOST_SOUNDS: Final = 40
 """Most sounds, the newest ones, from which poses are refined: older ones may be from before an array was moved."""
 
 POSITION_STD_M: Final = 0.1
-"""Standard deviation of positions that are refined, metres: as measured by tape."""
+"""Default standard deviation, in metres, of the arrays' positions in the site file before they are refined: as measured
+by tape."""
 
 
 class ProposalRefusedError(RunError):
-    """A proposal cannot come into force: it is not determined, or does not fit."""
+    """A proposal cannot come into force: the sounds do not determine its poses, or these do not fit the site."""
 
 
 class BusyError(RunError):
@@ -58,7 +60,7 @@ class Proposal:
     made_ns : int
         When it was made, UTC.
     site : Site
-        The site with the poses before.
+        The site with the poses that were in force when the proposal was made.
     microphones : mapping of array to (K, 3) float64
         The arrays that it moves, with their proposed places, metres.
     stored : mapping of array to CalibratedArray
@@ -71,7 +73,7 @@ class Proposal:
     next_place_m : (3,) float64 or None
         Place at which another clap would improve the poses most, metres.
     is_enough : bool
-        Whether another clap would hardly improve the poses.
+        Whether the poses of all arrays are known as well as is useful.
     refusal : str or None
         Why it cannot be accepted; None if it can.
     """
@@ -108,13 +110,14 @@ class Proposals:
         self._busy = threading.Lock()
         self._lock = threading.Lock()
         self._kept: OrderedDict[str, Proposal] = OrderedDict()
-        self._kept_of_thread: OrderedDict[str, Proposal] = OrderedDict()  # new ones come often, and push out no other
+        # kept apart: new ones come often, and must not push out those of people
+        self._kept_of_thread: OrderedDict[str, Proposal] = OrderedDict()
         self._made = 0
 
     # --- making proposals
 
     def by_claps(self, numbers: Sequence[int], places_m: FloatArray, place_std_m: float) -> Proposal:
-        """Measure the poses of the arrays by sounds (S,) at measured places (S, 3), metres.
+        """Measure the poses of the arrays by the sounds of these numbers, at measured places (S, 3), metres.
 
         Raises
         ------
@@ -122,6 +125,8 @@ class Proposals:
             With the number of a sound that is not kept any more.
         ValueError
             If no array received enough of the sounds.
+        PlaceOutsideError
+            If a place is far outside the room.
         BusyError
             If another measurement is running.
         """
@@ -214,12 +219,12 @@ class Proposals:
 
     @contextmanager
     def measuring(self) -> Iterator[None]:
-        """Hold the only place for a measurement by request, each of which takes seconds of a core.
+        """Allow one requested measurement at a time; each takes some seconds of processor time.
 
         Raises
         ------
         BusyError
-            If another one is running: a thread that waited would be missing for other requests.
+            If another one is running. Waiting for it would block a thread that serves requests.
         """
         if not self._busy.acquire(blocking=False):
             raise BusyError("another measurement is running; try again in some seconds")
@@ -282,7 +287,7 @@ def _microphones(measured: MeasuredSetUp) -> dict[str, FloatArray]:
 
 
 def _moved(site: Site, measured: MeasuredSetUp) -> Site:
-    """Return a site with measured arrays, which need not fit the room.
+    """Return a site with measured arrays, which may lie outside the room.
 
     Its speed of sound is that of the site, because the measured one does not come into force.
     """

@@ -1,4 +1,4 @@
-"""Keeps site time: the machine's clock in a live run, the recording's in a replay; decides when a replay has ended."""
+"""Keeps site time: the machine's clock in a live run, the recording's in a replay, which ends after a silence."""
 
 from __future__ import annotations
 

@@ -1,8 +1,9 @@
-"""The keys of the site file and their defaults: room, grid, arrays, cameras, uncertainty, fusion and privacy.
+"""The keys of the site file and defaults: room, grid spacing, frequency band (`band_hz`), arrays, cameras, privacy.
 
-The other sections are in `node_models`, `server_models`, `alert_models`, `zone_models` and `hub_models`.
+Defaults of `activity` are in `core/stream/activity.py`, those of `fusion` in `core/stream/parameters.py`.
 
-The models only validate; `livessl.site.build` computes from them.
+The other sections are in `node_models`, `server_models`, `alert_models`, `zone_models` and `hub_models`. The models
+only validate; `livessl.site.build` computes from them.
 """
 
 from __future__ import annotations

@@ -170,14 +170,14 @@ def test_the_class_of_a_clip_is_its_file_name_without_number(tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"--events": "nowhere"}, "expected a folder of sounds, got no such folder"),
-        ({"--events": "empty"}, "expected WAV or FLAC files, got none"),
+        ({"--sounds": "nowhere"}, "expected a folder of sounds, got no such folder"),
+        ({"--sounds": "empty"}, "expected WAV or FLAC files, got none"),
         ({"--classes": "door_slam,cat"}, "expected clips of cat .* door_slam, dropped_keys, phone, voice; .*--classes"),
-        ({"--rt": "fast"}, "--rt: expected seconds such as 0,0.4,0.8 or 0:2:0.2, got 'fast'"),
-        ({"--rt": "0:2:0"}, "--rt: expected seconds"),
-        ({"--rt": "0.05"}, "at least 0.17 s by Sabine"),
-        ({"--grid": "0"}, "--grid: expected 0.02 to 2 metres"),
-        ({"--sample-rate": "8000"}, "--sample-rate: the band ends at 6000 Hz"),
+        ({"--rt60": "fast"}, "--rt60: expected seconds such as 0,0.4,0.8 or 0:2:0.2, got 'fast'"),
+        ({"--rt60": "0:2:0"}, "--rt60: expected seconds"),
+        ({"--rt60": "0.05"}, "at least 0.17 s by Sabine"),
+        ({"--spacing": "0"}, "--spacing: expected 0.02 to 2 metres"),
+        ({"--rate": "8000"}, "--rate: the band ends at 6000 Hz"),
         ({"--with": "empty"}, "expected a finished campaign"),
     ],
 )
@@ -186,10 +186,10 @@ def test_wrong_use_is_one_clear_error(
 ) -> None:
     sounds = write_sounds(tmp_path / "sounds")
     (tmp_path / "empty").mkdir()
-    given = {"--events": "sounds", "--positions": "1", "--rt": "0", "--grid": "1", "--jobs": "1"} | changes
+    given = {"--sounds": "sounds", "--positions": "1", "--rt60": "0", "--spacing": "1", "--jobs": "1"} | changes
     options = []
     for name, value in given.items():
-        options += [name, str(tmp_path / value) if name in {"--events", "--with"} else value]
+        options += [name, str(tmp_path / value) if name in {"--sounds", "--with"} else value]
     if "--classes" not in given:
         options += ["--classes", ",".join(CLASSES)]
     assert sounds.exists()

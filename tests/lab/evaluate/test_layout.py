@@ -32,8 +32,8 @@ def _one_process(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def arguments(directory: Path, experiment: str, changes: Changes | None = None, *more: str) -> list[str]:
     sounds, site = write_sounds(directory / "sounds"), write_site(directory, changes)
-    options = f"--positions 3 --rt 0,0.3 --classes {','.join(CLASSES)} --jobs 1".split()
-    folders = ["--site", str(site), "--events", str(sounds), "--out", str(directory / "out")]
+    options = f"--positions 3 --rt60 0,0.3 --classes {','.join(CLASSES)} --jobs 1".split()
+    folders = ["--site", str(site), "--sounds", str(sounds), "--out", str(directory / "out")]
     return ["evaluate", experiment, *options, *folders, *more]
 
 
@@ -105,7 +105,7 @@ def test_campaigns_of_the_paper_keep_their_digest() -> None:
         ("one-array", {"arrays.north.band_hz": [4000, 6000]}, (), "array 'north': evaluate expects a band that begins"),
         ("one-array", {"arrays.north.band_hz": [100, 7000]}, (), "ends at 7000 Hz, expected 16334 Hz or more, got"),
         ("one-array", {"fusion.method": "music"}, (), r"site.yaml:\d+: fusion.method: expected one of"),
-        ("one-array", {}, ("--rt", "0.05"), "Sabine"),
+        ("one-array", {}, ("--rt60", "0.05"), "Sabine"),
     ],
 )
 def test_impossible_combinations_are_refused(

@@ -169,12 +169,12 @@ def test_fit_recovers_the_odds_that_made_the_events() -> None:
         (["--scenario", "nowhere"], "expected some of rooms, arrays, .*, got nowhere"),
         (["--snr", "loud"], "expected decibels such as 20 or inf,20,10, got 'loud'"),
         (["--snr", "nan"], "got 'nan'"),
-        (["--scenario", "walking", "--grid", "0.2"], "walking takes the spacing of the search grid from its site"),
+        (["--scenario", "walking", "--spacing", "0.2"], "walking takes the spacing of the search grid from its site"),
     ],
 )
 def test_wrong_options_are_refused(tmp_path: Path, option: list[str], said: str) -> None:
     parser = argparse.ArgumentParser()
     add_arguments(parser)
-    asked = ["localizer", "--events", str(write_sounds(tmp_path)), "--out", str(tmp_path / "out"), *option]
+    asked = ["localizer", "--sounds", str(write_sounds(tmp_path)), "--out", str(tmp_path / "out"), *option]
     with pytest.raises(ValueError, match=said):
         evaluate(parser.parse_args(asked), 1, lambda done, total: None)

@@ -261,14 +261,14 @@ def test_intervals_are_those_of_wilson_and_an_empty_one_says_nothing() -> None:
 @pytest.mark.parametrize(
     ("extra", "message"),
     [
-        (["--rt", "0.4"], "remove --rt"),
+        (["--rt60", "0.4"], "remove --rt60"),
         (["--scenario", "noise,rooms"], "noise: each of noise,"),
     ],
 )
 def test_impossible_arguments_are_refused(tmp_path: Path, extra: list[str], message: str) -> None:
     parser = argparse.ArgumentParser()
     add_arguments(parser)
-    arguments = ["localizer", "--scenario", "noise", "--events", str(tmp_path), "--out", str(tmp_path / "out"), *extra]
+    arguments = ["localizer", "--scenario", "noise", "--sounds", str(tmp_path), "--out", str(tmp_path / "out"), *extra]
     with pytest.raises(ValueError, match=message):
         evaluate(parser.parse_args(arguments), 1, lambda done, total: None)
 

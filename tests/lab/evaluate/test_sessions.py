@@ -81,8 +81,8 @@ def test_command_tracks_a_walking_talker(tmp_path: Path) -> None:
 
     parser = argparse.ArgumentParser()
     add_arguments(parser)
-    asked = ["localizer", "--scenario", "walking", "--events", str(sounds(tmp_path / "sounds")), "--classes", "speech"]
-    asked += ["--positions", "1", "--rt", f"{RT60_S:g}", "--snr", "30", "--seed", "8", "--out", str(tmp_path / "out")]
+    asked = ["localizer", "--scenario", "walking", "--sounds", str(sounds(tmp_path / "sounds")), "--classes", "speech"]
+    asked += ["--positions", "1", "--rt60", f"{RT60_S:g}", "--snr", "30", "--seed", "8", "--out", str(tmp_path / "out")]
     written = evaluate(parser.parse_args(asked), 1, lambda done, total: None)
     assert all(path.stat().st_size for path in written)
     assert (tmp_path / "out" / "figures" / "walks.png").exists()

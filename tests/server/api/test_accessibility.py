@@ -251,7 +251,7 @@ def answer_with(page: Page, path: str, **answer: Any) -> None:
 @pytest.mark.parametrize("role", ["operator", "viewer"])
 def test_set_up_view_of_each_role(browser: Browser, desk: Desk, role: str) -> None:
     with faultless_page(browser) as page:
-        answer_with(page, "findings", sounds=3, findings=FINDINGS, blind_spots=BLIND_SPOTS)
+        answer_with(page, "findings", sounds=3, least_sounds=3, findings=FINDINGS, blind_spots=BLIND_SPOTS)
         opened(page, f"{desk.server.url}/#set-up", desk.tokens[role])
         expect(page.get_by_test_id("findings")).to_contain_text("exchange the plugs", timeout=MS)
         expect(page.get_by_test_id("blind-spots")).to_contain_text("note these sounds cannot show", timeout=MS)

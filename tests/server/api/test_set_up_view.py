@@ -10,6 +10,7 @@ from playwright.sync_api import Browser, Page, expect
 
 from browser import box_of, faultless_page, running_browser, visit
 from known_sounds import events, finish, places_m
+from livessl.core.commission.finding import LEAST_SOUNDS
 from livessl.core.types import Event
 from livessl.server.app import Server
 from scene_server import replay_scene
@@ -114,7 +115,7 @@ def test_verification_beside_another_one_is_told_and_the_next_clap_counts_both(
 def test_inputs_show_their_levels_and_the_live_view_comes_back(browser: Browser, server: Server) -> None:
     with faultless_page(browser) as page:
         opened(page, server)
-        expect(page.get_by_test_id("no-finding")).to_contain_text("Clap three times")
+        expect(page.get_by_test_id("no-finding")).to_contain_text(f"Clap {LEAST_SOUNDS} times")
         replay_scene(server)
         row = page.get_by_test_id("set-up-south")
         expect(row).to_have_attribute("data-state", "healthy", timeout=MS)

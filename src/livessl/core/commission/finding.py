@@ -1,4 +1,4 @@
-"""A finding of doctor as a value (code, severity, place, words, cure), and the order of findings.
+"""A finding of doctor as a value, the order of findings, and how many sounds (claps) doctor needs (`LEAST_SOUNDS`).
 
 The findings themselves are made and worded in `findings`.
 """
@@ -11,7 +11,7 @@ from enum import StrEnum
 from typing import Final
 
 LEAST_SOUNDS: Final = 3
-"""Fewest sounds from which delays are judged."""
+"""Fewest sounds from which delays are judged: `doctor` and the set-up view ask for more claps below it."""
 
 OF_SET_UP: Final = frozenset(
     {"swapped", "mirrored", "exchanged", "turned", "moved", "late_channel", "geometry", "temperature"}

@@ -1,4 +1,6 @@
-"""Frequency bands of arrays: bins inside, power in a band, dead channels of a sound, when the envelope is used.
+"""Applies an array's frequency band: bins inside it, power in it, dead channels of a sound, when the envelope is used.
+
+Which band is used: the default of `band_hz` is in `site/models.py`, an array's own in `site/build/arrays.py`.
 
 Checking a site file loads this module, so it imports nothing that locates.
 """

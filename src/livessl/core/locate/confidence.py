@@ -1,6 +1,6 @@
-"""Computes the confidence of a position, scales its covariance, and decides below which confidence it is refused.
+"""Computes the confidence of a position, scales its covariance, and refuses it below the confidence threshold.
 
-It sees correlations and no sound. The constants were fitted to simulated events by
+The threshold is `LEAST_CONFIDENCE`. It sees correlations and no sound. The constants were fitted to simulated events by
 `livessl evaluate localizer --half development`.
 """
 

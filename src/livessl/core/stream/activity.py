@@ -1,4 +1,4 @@
-"""Activity detection: from which level on a frame is active, the noise floor, hang-over and pre-roll of a sound.
+"""Activity detection: from which level (threshold) on a frame is active, noise floor, default hang-over and pre-roll.
 
 The rule (Garcia-Barrios et al., section on the sound activity detector): a frame is active if its mean power is at
 least a tenth of the reference power. Over a finished event the reference is the event's maximum. Live it is a decaying

@@ -1,4 +1,6 @@
-"""Makes updates, events and tracks from the frames of all arrays: the order of the stages. It reads no clock.
+"""Fuses all arrays' frames: decides when an event begins and ends (hang-over, longest event); the order of the stages.
+
+The lengths are in `activity` (hang-over) and `parameters` (`max_event_s`). It reads no clock.
 
 `Fusion.step(messages, now_ns)` is the only entry for messages, live and replayed. It uses these stages: `Alignment`
 assigns the frames to joint frame indices and closes them, `EvidenceCollector` correlates frames and collects excerpts,

@@ -1,4 +1,4 @@
-"""Defaults of the fusion: window, update interval, longest event, waits for late arrays and for backfill."""
+"""Defaults of the fusion: window, update interval, longest event, deadline of late arrays, backfill, sources."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Decides when an event begins and ends (hang-over, longest event), and keeps its state until it is reported.
+"""Keeps the state of an event (open, ended, awaiting backfill) until it is reported, and decides nothing.
 
-It locates nothing. The event's id, status and reason are made in `verdict`.
+`Fusion` in `fusion` decides when an event begins and ends. Its id, status and reason are made in `verdict`.
 
 Its states are these.
 

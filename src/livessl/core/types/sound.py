@@ -1,4 +1,4 @@
-"""Sound as values: blocks, frames, marks, GCCs and arrays; their limits, and the length of a frame."""
+"""Sound as values: blocks, frames, marks, GCCs and arrays; their limits, and the frame length (50 ms)."""
 
 from __future__ import annotations
 

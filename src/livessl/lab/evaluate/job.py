@@ -96,7 +96,7 @@ def read_clips(directory: Path, classes: Iterable[str], sample_rate_hz: float) -
         If the folder holds no sound, or none of a class.
     """
     if not directory.is_dir():
-        raise ValueError(f"--events {directory}: expected a folder of sounds, got no such folder")
+        raise ValueError(f"--sounds {directory}: expected a folder of sounds, got no such folder")
     high_pass = butter(2, HIGH_PASS_HZ, "highpass", fs=sample_rate_hz, output="sos")
     found: dict[str, list[Any]] = {}
     for name, samples in read_sounds(directory, sample_rate_hz):
@@ -105,7 +105,7 @@ def read_clips(directory: Path, classes: Iterable[str], sample_rate_hz: float) -
     missing = [name for name in classes if name not in found]
     if missing:
         raise ValueError(
-            f"--events {directory}: expected clips of {', '.join(missing)} (such as {missing[0]}001.wav), got the "
+            f"--sounds {directory}: expected clips of {', '.join(missing)} (such as {missing[0]}001.wav), got the "
             f"classes {', '.join(sorted(found))}; name others with --classes"
         )
     return {name: tuple(found[name]) for name in classes}

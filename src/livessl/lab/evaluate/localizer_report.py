@@ -156,7 +156,7 @@ def _medians_m(columns: Columns, chosen: Any, drawn: Any) -> FloatArray:
 
 def _blocks(columns: Columns, rows: Sequence[SummaryRow], settings: Mapping[str, Any]) -> list[Block]:
     named = "" if settings["scenarios"] == [ROOMS] else f"--scenario {','.join(settings['scenarios'])} "
-    listed = {"rt": settings["rt60s_s"], "snr": settings["snrs_db"]}
+    listed = {"rt60": settings["rt60s_s"], "snr": settings["snrs_db"]}
     conditions = " ".join(f"--{name} {','.join(f'{value:g}' for value in values)}" for name, values in listed.items())
     blocks: list[Block] = [
         Heading(1, "The default localizer against the paper's standard"),
@@ -165,7 +165,7 @@ def _blocks(columns: Columns, rows: Sequence[SummaryRow], settings: Mapping[str,
         "the event's mean power at the two arrays 5 m apart, over its whole recording including its reverberation. "
         f"Both methods get the same samples and refine below a grid of {settings['spacing_m']:g} m. An event is "
         f"refused if its confidence is below {LEAST_CONFIDENCE:g}.",
-        f"Command: `livessl evaluate localizer {named}--events DIR --positions {settings['positions']} {conditions} "
+        f"Command: `livessl evaluate localizer {named}--sounds DIR --positions {settings['positions']} {conditions} "
         f"--seed {settings['seed']} --half {settings['half']} --out DIR`, with the sounds of DCASE 2016 task 2.",
         "*Median*, *95 %*, *over 0.5 m* and *in the 90 % ellipsoid* are over the located events; *direction error* is "
         "the median angle at the nearest array, over all events. *Lost* events are not located, or located more than "

@@ -57,7 +57,7 @@ def _blocks(columns: Columns, rows: Sequence[SummaryRow], settings: Mapping[str,
         "empty where noise has no place. The *median* and "
         "*in the 90 % ellipsoid* are over the located sounds. *Within 0.5 m* counts sounds that are not located, too. "
         "Brackets hold 95 % intervals by Wilson, as if all sounds were independent.",
-        f"Command: `livessl evaluate localizer --scenario {NOISE} --events DIR --positions {settings['positions']} "
+        f"Command: `livessl evaluate localizer --scenario {NOISE} --sounds DIR --positions {settings['positions']} "
         f"--snr {levels} --seed {settings['seed']} --half {settings['half']} --out DIR`, with the sounds of DCASE 2016 "
         "task 2.",
         Heading(2, "By kind and level of noise"),

@@ -228,7 +228,7 @@ _ABOUT: Final[Mapping[str, str]] = {
 def _blocks(rows: Sequence[SummaryRow], settings: Mapping[str, Any], *, drawn: bool) -> list[Block]:
     name = settings["scenario"]
     scenario = SESSIONS[name]
-    listed = {"rt": settings["rt60s_s"], "snr": settings["snrs_db"]}
+    listed = {"rt60": settings["rt60s_s"], "snr": settings["snrs_db"]}
     conditions = " ".join(
         f"--{option} {','.join(f'{value:g}' for value in values)}" for option, values in listed.items()
     )
@@ -249,7 +249,7 @@ def _blocks(rows: Sequence[SummaryRow], settings: Mapping[str, Any], *, drawn: b
         "0.5 m, 5 m apart, and sent block by block through the whole fusion with its defaults; sounds of the "
         f"{settings['half']} half, seed {settings['seed']}. {_ABOUT[name]} Intervals are 99 % intervals (bootstrap "
         "over sessions).",
-        f"Command: `livessl evaluate localizer --scenario {name} --events DIR --positions {settings['positions']} "
+        f"Command: `livessl evaluate localizer --scenario {name} --sounds DIR --positions {settings['positions']} "
         f"{conditions} --seed {settings['seed']} --half {settings['half']} --out DIR`, with the sounds of DCASE 2016 "
         "task 2.",
         Table(("case", "RT60", "SNR", "method", *(_COLUMNS[each][0] for each in shown)), cells),

@@ -103,7 +103,7 @@ def _add_events(router: APIRouter, parts: Parts, searched: Any) -> None:
         "/api/v1/events", tags=["estimates"], response_model=answers.EventPage, responses={**_NAMES, **UNCHANGED}
     )
     def get_events(request: Request, query: EventQuery = listed) -> Response:
-        """Finished events, newest first."""
+        """Events, newest first, early ones included; the final result of an event replaces the early one."""
         return page_answer(request, store.page(query))
 
     @router.get(
@@ -129,7 +129,7 @@ def _add_exports(router: APIRouter, parts: Parts, searched: Any) -> None:
                 raise HTTPException(501, "Parquet needs the package pyarrow; pip install 'livessl[export]'")
             name = f"{parts.site.site}-events.{form}".encode("ascii", "replace").decode().replace('"', "_")
             headers = {"Content-Disposition": f'attachment; filename="{name}"'}
-            if "head_only" in request.scope:  # the stream is not begun, because its body would not be sent
+            if "head_only" in request.scope:  # a HEAD request gets no body, so the stream is not begun
                 return Response(media_type=media_type, headers=headers)
             return StreamingResponse(encode(parts.store.scan(query)), media_type=media_type, headers=headers)
 
@@ -169,8 +169,9 @@ def _add_heat_map(router: APIRouter, parts: Parts, searched: Any) -> None:
         """Number of events in each cell of the floor plan; with format=png a picture, y upwards."""
         cells = Cells(low_mm, high_mm, round(1000 * spacing_m))
         if cells.shape[0] * cells.shape[1] > MAX_CELLS:
-            most = f"{cells.shape[0]} x {cells.shape[1]}"
-            raise unprocessable("spacing_m", f"spacing_m: expected at most {MAX_CELLS} cells, got {most}; raise it")
+            count = f"{cells.shape[0]} x {cells.shape[1]} = {cells.shape[0] * cells.shape[1]}"
+            what = f"spacing_m: expected at most {MAX_CELLS} cells, got {count}; raise spacing_m"
+            raise unprocessable("spacing_m", what)
         found = parts.store.heat_map(query, cells)
         if format == "png":
             return cached(request, map_png(found.counts.T.astype(np.float32)), "image/png")

@@ -25,8 +25,8 @@ OTHER_PAGE: Final = "a page of another server"
 """Reasons of refusals, as metrics and the log name them."""
 
 MAX_SHOWN: Final = 32
-"""Longest part of a refused name that an answer repeats, in characters: with both cures, it fills the 123 bytes of a
-WebSocket's closing reason."""
+"""Longest part of a refused name that an answer repeats, in characters. The text of `other_page`, which names both
+cures, is then as long as the closing reason of a WebSocket may be: 123 bytes."""
 
 _OWN: Final = ("127.0.0.1", "localhost", "[::1]")
 _PORTS: Final = {"http": ":80", "https": ":443"}
@@ -56,10 +56,11 @@ class ServerNames:
     def may_open(self, headers: Headers) -> bool:
         """Return True if a client may open a WebSocket.
 
-        The page that opens it must be of the host that the request is addressed to, of `trusted_hosts`, whatever its
-        port, or of `allowed_origins`. Browsers do not check that, but they send the page's `Origin`; a request without
-        `Origin` comes from another program and is accepted. Behind a proxy that replaces the host, only
-        `X-Forwarded-Host` or `trusted_hosts` reveal the name that the browser uses.
+        A page may open one if its host and port are those that the request is addressed to, if its host is in
+        `trusted_hosts` (any port), or if its origin is in `allowed_origins`. Browsers leave this check to the server,
+        and send the page's `Origin`; a request without `Origin` comes from another program and is accepted.
+        Behind a proxy that replaces the host, only `X-Forwarded-Host` or `trusted_hosts` reveal the name that the
+        browser uses.
         """
         scheme, _, page = headers.get("origin", "").lower().partition("://")
         if "origin" not in headers or headers["origin"].lower() in self._origins:

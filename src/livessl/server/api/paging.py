@@ -1,4 +1,4 @@
-"""Pages of events, and answers with an ETag. The histories of a server and of a hub both use them."""
+"""Pages of events: page size (limit), cursors, and answers with an ETag; for the histories of a server and of a hub."""
 
 from __future__ import annotations
 

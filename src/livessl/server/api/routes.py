@@ -15,6 +15,7 @@ from pydantic import WithJsonSchema
 from livessl import __version__
 from livessl.clock import utc_text
 from livessl.core.commission.blind_spot import CURE, BlindSpot
+from livessl.core.commission.finding import LEAST_SOUNDS
 from livessl.core.types import FRAME_S
 from livessl.schema import answers
 from livessl.schema.answers import errors
@@ -137,7 +138,8 @@ def _add_state(router: APIRouter, parts: Parts) -> None:
         state = parts.set_up_watch.state
         findings = [{"kind": "finding", **asdict(finding)} for finding in state.findings]
         blind_spots = [_blind_spot(spot) for spot in state.blind_spots]
-        return as_json({"v": API_VERSION, "sounds": state.sounds, "findings": findings, "blind_spots": blind_spots})
+        sounds = {"sounds": state.sounds, "least_sounds": LEAST_SOUNDS}
+        return as_json({"v": API_VERSION, **sounds, "findings": findings, "blind_spots": blind_spots})
 
     @router.get("/api/v1/tracks", tags=["estimates"], response_model=answers.Tracks)
     def get_tracks() -> Response:

@@ -235,7 +235,9 @@ class Proposal(BaseModel):
     speed: MeasuredSpeed | None = Field(description="Null for typed poses.")
     claps: list[FittedClap]
     next_place_m: PlaceM | None = Field(description="Where another clap would improve the poses most; null if nowhere.")
-    enough: bool = Field(description="Whether another clap would hardly improve the poses.", examples=[False])
+    enough: bool = Field(
+        description="Whether the poses of all arrays are known as well as is useful.", examples=[False]
+    )
     refusal: str | None = Field(description="Why it cannot be accepted; null if it can.", examples=[None])
 
 

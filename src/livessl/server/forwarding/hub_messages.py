@@ -1,4 +1,7 @@
-"""Chooses which messages of a site go to the hub, and puts them into the outbox."""
+"""Chooses which alerts, tracks and changes of arrays go to the hub, and puts them into the outbox.
+
+Final events come from `store.py`, which writes them into history and outbox in one transaction.
+"""
 
 from __future__ import annotations
 

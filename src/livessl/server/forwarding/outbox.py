@@ -1,4 +1,4 @@
-"""Stores messages for the hub in the history's database until the stream has acknowledged them; drops the oldest.
+"""Stores messages for the hub in the history's database until the stream has acknowledged them; limits how many.
 
 What a final pass stores and what it sends are written in one transaction, so neither exists without the other.
 """

@@ -106,7 +106,7 @@ FORMATS: Final[dict[str, tuple[str, Callable[[Pages], Iterator[bytes]]]]] = {
     "parquet": ("application/octet-stream", parquet),
 }
 """Media type and encoder of each format. JSON Lines and Parquet are `application/octet-stream`, because generators of
-clients do not know their own types."""
+clients do not know the media types of these two formats."""
 
 
 def _cell(value: Any) -> Any:

@@ -50,7 +50,7 @@ export class PosesPanel {
       const refusal = find("proposal-refusal");
       refusal.hidden = proposal.refusal === null;
       write(refusal, proposal.refusal === null ? "" : `These poses cannot be accepted: ${proposal.refusal}.`);
-      this.say(proposal.enough ? "Good enough: another clap would hardly improve the poses." : "");
+      this.say(proposal.enough ? "Good enough: the poses of all arrays are known as well as is useful." : "");
     }
     this.#enable();
     this.redraw();

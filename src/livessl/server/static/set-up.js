@@ -111,12 +111,12 @@ export class SetUp {
 
   async #loadFindings() {
     try {
-      const { sounds, findings, blind_spots: blindSpots } = await this.load("findings");
+      const { sounds, least_sounds: least, findings, blind_spots: blindSpots } = await this.load("findings");
       write(find("set-up-sounds"), sounds === 0 ? "no sound yet" : `from the last ${counted(sounds, "sound")}`);
       find("set-up-findings").replaceChildren(...findings.map(findingItem));
       const none = find("set-up-no-finding");
       none.hidden = findings.length > 0;
-      write(none, sounds < 3 ? "Clap three times or more, at different places in the room" : "Nothing wrong was found");
+      write(none, sounds < least ? `Clap ${least} times or more, at different places in the room` : "Nothing wrong was found");
       find("set-up-blind-spots").replaceChildren(...blindSpots.map(blindSpotItem));
     } catch (error) {
       console.warn("livessl:", error.message);
