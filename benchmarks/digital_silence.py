@@ -1,13 +1,14 @@
 """Streams with digital silence: what is taken for sound in the noise after it, and which sounds are lost.
 
 `python benchmarks/digital_silence.py --events DIR [--streams N] [--seed S]`. The sounds between silences without any
-noise are those of DCASE 2016 task 2. The results are in docs/decisions/0080-digital-silence-is-no-background.md.
+noise are those of DCASE 2016 task 2. The results are in docs/accuracy/robustness.md.
 """
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -28,6 +29,12 @@ SPEC: Final = ArraySpec("array", 0.1 * np.vstack([np.zeros(3), np.eye(3)]), BAND
 SILENCES_S: Final = (0.05, 0.13, 0.2, 0.5, 1.3, 2.9, 5.0)
 """Digital silence at the start of a stream, in seconds."""
 
+DROPOUTS_S: Final = (0.2, 1.0, 4.0)
+"""Longest dropout of a stream, and longest noise between two, in seconds."""
+
+RINGS_S: Final = (1.0, 2.5, 8.0)
+"""Length of a steady ring, in seconds."""
+
 ROOMS_S: Final = (0.05, 0.7, 2.0)
 """Reverberation times, in seconds, of the sounds without noise."""
 
@@ -35,10 +42,10 @@ CLIPS: Final = 5
 """Sounds in a stream without noise."""
 
 
-def active_frames(samples: FloatArray) -> BoolArray:
+def active_frames(samples: FloatArray, spec: ArraySpec = SPEC) -> BoolArray:
     """Return which frames of a stream (4, n) are sent as active: (F,)."""
     framer = Framer(float(RATE_HZ))
-    segmenter = Segmenter(SPEC, np.arange(4), float(RATE_HZ), ActivityParameters())
+    segmenter = Segmenter(spec, np.arange(4), float(RATE_HZ), ActivityParameters())
     messages = []
     for index in range(0, samples.shape[1], 480):
         block = Block(
@@ -104,6 +111,51 @@ def clap_after_silence(streams: int, seed: int) -> str:
     return f"| silence, then a clap in noise | {streams} | {goes_on} | {lost} |"
 
 
+def noise_between_dropouts(streams: int, seed: int, longest_s: float) -> str:
+    """Play noise with two to eight dropouts, and a burst 5 s later; return a row: false sounds, and lost bursts."""
+    false = lost = 0
+    for number in range(streams):
+        rng = np.random.default_rng([seed, number, round(1000 * longest_s)])
+        level = 10.0 ** (rng.uniform(-80.0, -30.0) / 20.0)
+        parts = [noise(rng, 3.0, level)]
+        for _ in range(int(rng.integers(2, 9))):
+            parts += [zeros(rng.uniform(0.01, longest_s)), noise(rng, rng.uniform(0.05, longest_s), level)]
+        parts.append(noise(rng, 8.0, level))
+        samples = np.concatenate(parts, axis=1)
+        begin = samples.shape[1] - 3 * RATE_HZ
+        burst = 20.0 * level * decaying(rng, 0.4, 0.65)
+        samples[:, begin : begin + burst.shape[1]] += burst
+        active = active_frames(samples)
+        false += bool(active[: begin // FRAME - 1].any())
+        lost += not active[begin // FRAME : begin // FRAME + 3].any()
+    return f"| noise with dropouts of up to {longest_s:g} s | {streams} | {false} | {lost} |"
+
+
+def ring_out_of_silence(streams: int, seed: int, length_s: float) -> str:
+    """Play silence and a steady ring that travels to each microphone; return a row: rings found late, and lost ones."""
+    late = lost = 0
+    for number in range(streams):
+        rng = np.random.default_rng([seed, number, round(1000 * length_s)])
+        t_s = np.arange(round(length_s * RATE_HZ)) / RATE_HZ
+        ring = sum(np.sin(2.0 * np.pi * hz * t_s) for hz in rng.uniform(400.0, 3000.0, 3))
+        size, edge_m, rt60_s = rng.uniform(3.0, 20.0), rng.uniform(0.1, 0.6), rng.uniform(0.1, 2.0)
+        source_m = rng.uniform(0.1, 0.9, 3) * size
+        microphones_m = edge_m / 0.1 * SPEC.microphones_m + rng.uniform(0.2, 0.8, 3) * size
+        samples = zeros(length_s + 3.0 + 2.0 * rt60_s)
+        begin = round(rng.uniform(0.3, 2.0) * RATE_HZ)
+        delays = np.round(np.linalg.norm(microphones_m - source_m, axis=1) / 343.0 * RATE_HZ).astype(int)
+        for row, delay in zip(samples, delays.tolist(), strict=True):
+            tail = 0.05 * decaying(rng, rt60_s, rt60_s)[0]
+            tail[0] = 1.0
+            wet = np.convolve(ring, tail) * 10.0 ** (-35.0 / 20.0)
+            row[begin + delay : begin + delay + len(wet)] += wet[: len(row) - begin - delay]
+        active = active_frames(samples, replace(SPEC, microphones_m=microphones_m))
+        first, last = (begin + int(delays.min())) // FRAME, (begin + int(delays.max()) + len(ring)) // FRAME
+        lost += not active[first : last + 1].any()
+        late += not active[first : first + 3].any()
+    return f"| silence, then a steady ring of {length_s:g} s, RT60 0.1 to 2 s | {streams} | {late} | {lost} |"
+
+
 def clips_in_silence(clips: Sequence[Float32Array], streams: int, seed: int, rt60_s: float) -> str:
     """Play sounds with silence between them; return a row: streams whose first sound is lost, and all lost sounds."""
     first = lost = 0
@@ -132,11 +184,15 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     given = parser.parse_args()
     clips = [clip for each in read_clips(given.events, CLASSES, float(RATE_HZ)).values() for _, clip in each]
-    print("| | streams | with a false sound, a sound that goes on, or the first sound lost | sounds lost |")
+    print("| | streams | with a false sound, a sound that goes on or is late, or the first lost | sounds lost |")
     print("|---|---|---|---|")
     for silence_s in SILENCES_S:
         print(noise_after_silence(given.streams, given.seed, silence_s), flush=True)
     print(clap_after_silence(given.streams, given.seed), flush=True)
+    for longest_s in DROPOUTS_S:
+        print(noise_between_dropouts(given.streams, given.seed, longest_s), flush=True)
+    for length_s in RINGS_S:
+        print(ring_out_of_silence(given.streams, given.seed, length_s), flush=True)
     for rt60_s in ROOMS_S:
         print(clips_in_silence(clips, given.streams, given.seed, rt60_s), flush=True)
 

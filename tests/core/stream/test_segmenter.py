@@ -197,14 +197,6 @@ def test_burst_in_noise_just_after_digital_silence_is_found_and_ends(
     assert max(active) <= begin + 10
 
 
-def test_steady_sounds_of_a_noise_gate_are_found_from_the_second_on() -> None:
-    """The first one is held back for the warm-up and then taken for the background; a gate shows by closing again."""
-    steady = sound([LOUD] * 24)
-    messages = run(after_silence(1.0, steady, 2.0, steady, 5.0, steady, 1.0))
-    active = [frame.frame_index - START for frame in frames_of(messages) if frame.active]
-    assert active == [*range(84, 108), *range(208, 232)]
-
-
 def test_digital_silence_is_marked_at_once() -> None:
     framer, made = Framer(RATE_HZ), segmenter()
     (cut,) = framer.push(Block(0, np.zeros((4, N), dtype=np.float32), START * FRAME_NS))

@@ -7,7 +7,7 @@ which level on a frame is active.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from typing import Final
@@ -17,6 +17,13 @@ import scipy
 
 from livessl.core.correlate.band import spectrum_power
 from livessl.core.stream.activity import ActivityParameters, CausalActivity
+from livessl.core.stream.digital_silence import (
+    DIGITAL_SILENCE,
+    LEAST_SILENT_FRAMES,
+    LEAST_SOUND,
+    SilenceEdges,
+    sound_shares,
+)
 from livessl.core.stream.steady_background import SteadyBackground
 from livessl.core.stream.timeline import Cut, FramerState
 from livessl.core.types import FRAME_S, ArraySpec, Float32Array, FloatArray, Frame, IntArray, Mark, Message
@@ -30,9 +37,20 @@ WARM_UP_FRAMES: Final = 10
 background. The quietest of them is the first estimate of the background, without the first frame if the device fades in
 there."""
 
-DIGITAL_SILENCE: Final = 1e-14
-"""In-band power, full scale squared, below which a frame is digital silence: -140 dBFS. The noise of the best
-converters is 15 dB above it; zeros and other constants are below it."""
+HELD_FRAMES: Final = 8
+"""Number of frames that are still compared for the rest of the background's window, after a warm-up that follows
+digital silence and was steady. A frame is sent 0.35 s late then; at 0.5 s, others no longer wait for it."""
+
+FALLEN: Final = 4.0
+"""Ratio of the mean level of the oldest held frames to that of the newest, 6 dB, at and above which a steady sound has
+ended: a sound must be as much louder than the background to be found."""
+
+COMPARED: Final = 3
+"""Number of held frames in each of these means; low-pitched noise scatters less than 6 dB in 0.15 s."""
+
+DROPOUT_MARGIN: Final = 4.0
+"""Further ratio, 6 dB, by which a frame with a dropout must be louder: its level is that of as little as 10 ms, and the
+switching spreads low frequencies over the band."""
 
 FADE_IN: Final = 4.0
 """Ratio of the powers of the first frame's halves at and above which a device fades in: a sound must be as much louder
@@ -51,11 +69,14 @@ class Measured:
         Their mean.
     spectrum : (F,) float64
         Power in each bin: see `SteadyBackground.spectra`.
+    sound_share : float
+        Share of the frame without dropouts, from 0 to 1: see `sound_shares`.
     """
 
     channel_power: FloatArray
     power: float
     spectrum: FloatArray
+    sound_share: float
 
 
 class Segmenter:
@@ -64,9 +85,10 @@ class Segmenter:
     Every frame index yields one message in order: a `Mark` while it is quiet, a `Frame` around sound. When sound
     begins, the pre-roll, whose frame indices were marked as quiet before, is sent as frames.
 
-    Drivers deliver zeros until a device runs. This digital silence is no measure of the background. The warm-up follows
-    it, unless the background is known from less than its window before. Digital silence that returns within this
-    window, as that of a noise gate or of a simulation without noise, is the background, until there is a gap.
+    Drivers deliver zeros until a device runs, and while it drops out. This digital silence is no measure of the
+    background. The warm-up follows it, unless the background is known from less than its window before. Digital silence
+    is the background if sound begins after it or ends in it, as that of a noise gate or of a simulation without noise:
+    see `SilenceEdges`. It remains so until noise ends at once, or until there is a gap.
 
     Parameters
     ----------
@@ -101,6 +123,7 @@ class Segmenter:
         self._sequence = 0
         self._frame_index: int | None = None
         self._floor_frames = round(parameters.floor_window_s / FRAME_S)
+        self._edges = SilenceEdges(channels, spec.aperture_m, sample_rate_hz)
         self._silent_frames = 0
         self._frames_since_silence: int | None = None  # None before the first since the start or a gap
         self._is_silence_background = False
@@ -119,7 +142,7 @@ class Segmenter:
             plain = scipy.fft.rfft(samples.reshape(count * channels, length), axis=1)
             power = spectrum_power(plain, length, self._rate_hz, self._spec.band_hz).reshape(count, channels)
             spectra = self._background.spectra(samples, plain.reshape(count, channels, -1))
-            measured += map(Measured, power, power.mean(axis=1).tolist(), spectra)
+            measured += map(Measured, power, power.mean(axis=1).tolist(), spectra, sound_shares(samples).tolist())
         return measured
 
     def push(self, cut: Cut, state: FramerState) -> list[Message]:
@@ -134,54 +157,119 @@ class Segmenter:
             self._recent.clear()
             self._quiet_frames = self._hang_over + 1
             self._frames_since_silence, self._is_silence_background = None, False
+            self._edges.restart()
         self._frame_index = cut.frame_index
-        if measured.power < DIGITAL_SILENCE:
+        self._edges.push(cut)
+        is_dropout = not self._is_silence_background and measured.sound_share < LEAST_SOUND
+        if measured.power < DIGITAL_SILENCE or is_dropout:
             return self._take_silence(cut, measured, state)
         if self._frames_since_silence is not None:
+            self._begin_after_silence()
             self._frames_since_silence += 1
         return self._take_sound(cut, measured, state)
 
+    def _begin_after_silence(self) -> None:
+        """Take digital silence for the background if what ends it begins as sound does."""
+        if self._frames_since_silence != 0:
+            return
+        self._edges.begin()
+        is_long = self._silent_frames >= LEAST_SILENT_FRAMES
+        if is_long and not self._is_silence_background and self._edges.begins_as_sound():
+            self._is_silence_background = True
+            self._activity, self._warm_up = CausalActivity(self._parameters), None
+
     def _take_sound(self, cut: Cut, measured: Measured, state: FramerState) -> list[Message]:
-        found_hum = self._background.learn(measured.spectrum)
-        if self._warm_up is None:
-            if found_hum:
-                self._activity.restart(self._background.usual_power, self._background.changing_maximum)
-            level = self._background.changing_power(measured.spectrum, measured.power)
-            return self._decide(cut, measured, level, state, active=self._activity.push(level))
-        self._warm_up.append((cut, measured))
-        return self.flush(state) if len(self._warm_up) >= WARM_UP_FRAMES else []
+        is_whole = self._is_whole(measured)
+        found_hum = is_whole and self._background.learn(measured.spectrum)
+        if found_hum and (self._warm_up is None or self._activity.floor_power > 0.0):
+            self._activity.restart(self._background.usual_power, self._background.changing_maximum)
+        if is_whole:
+            self._edges.note_level(self._level(measured))
+        if self._warm_up is not None:
+            return self._hold_back(cut, measured, state)
+        return self._decide(cut, measured, state, active=self._is_active(measured))
+
+    def _is_whole(self, measured: Measured) -> bool:
+        """Return whether a frame has no dropout; where silence is the background, none has."""
+        return measured.sound_share == 1.0 or self._is_silence_background
+
+    def _is_active(self, measured: Measured) -> bool:
+        """Apply the activity rule to the next frame. One with a dropout is no measure of the background."""
+        level, least = self._level(measured), self._parameters.least_power(self._activity.floor_power)
+        if not self._is_whole(measured) and level < DROPOUT_MARGIN * least:
+            return False
+        return self._activity.push(level)
+
+    def _level(self, measured: Measured) -> float:
+        """Return the level of a frame, full scale squared, without dropouts unless silence is the background."""
+        power = self._background.changing_power(measured.spectrum, measured.power)
+        return power if self._is_silence_background else power / max(measured.sound_share, LEAST_SOUND)
 
     def _take_silence(self, cut: Cut, measured: Measured, state: FramerState) -> list[Message]:
-        """Take in a frame of digital silence, which is the background once it has returned soon."""
-        if self._frames_since_silence is not None and 0 < self._frames_since_silence <= self._floor_frames:
-            self._is_silence_background = True
-        self._silent_frames = 1 if self._frames_since_silence != 0 else self._silent_frames + 1
+        """Take in a frame of digital silence, which is the background after a sound that ended in it."""
+        since, was_background = self._frames_since_silence, self._is_silence_background
+        if since != 0:
+            ends_as_sound = self._edges.ends_as_sound()
+            if not ends_as_sound:
+                self._is_silence_background = False
+            elif since is not None and since <= self._floor_frames:
+                self._is_silence_background = True
+        self._silent_frames = 1 if since != 0 else self._silent_frames + 1
         self._frames_since_silence = 0
-        messages = self._end_warm_up(state, 0.0) if self._warm_up else []
+        messages: list[Message] = []
+        if self._warm_up:
+            messages = self._end_warm_up(state, 0.0 if self._is_silence_background else None)
         if self._is_silence_background:
             self._warm_up = None
             return messages + self._take_sound(cut, measured, state)
-        if messages or self._silent_frames == self._floor_frames:
+        if messages or was_background or self._silent_frames == self._floor_frames:
             self._activity, self._warm_up = CausalActivity(self._parameters), []
-        return messages + self._decide(cut, measured, measured.power, state, active=False)
+        return messages + self._decide(cut, measured, state, active=False)
+
+    def _hold_back(self, cut: Cut, measured: Measured, state: FramerState) -> list[Message]:
+        """Hold a frame back for the warm-up, and after silence for as long as a steady sound may turn out to end."""
+        held = self._warm_up = [*(self._warm_up or []), (cut, measured)]
+        is_primed = self._activity.floor_power > 0.0
+        if len(held) < WARM_UP_FRAMES and not is_primed:
+            return []
+        if self._frames_since_silence is None:
+            return self.flush(state)
+        if not is_primed:
+            self._activity.prime(self._quietest(held))
+        levels = [self._level(known) for _, known in held if self._is_whole(known)]
+        if len(levels) > COMPARED and FALLEN * sum(levels[-COMPARED:]) <= sum(levels[:COMPARED]):
+            return self._end_warm_up(state, min(levels))
+        begins = max(levels, default=0.0) >= self._parameters.least_power(self._activity.floor_power)
+        if begins or self._frames_since_silence >= self._floor_frames:
+            return self.flush(state)
+        decided = 1 + len(held) - HELD_FRAMES
+        self._warm_up = held[decided:]
+        return self._decide_all(held[:decided], state)
 
     def flush(self, state: FramerState) -> list[Message]:
         """End the warm-up, as the end of a short stream must."""
         return self._end_warm_up(state)
 
     def _end_warm_up(self, state: FramerState, floor_power: float | None = None) -> list[Message]:
-        """Decide about the frames that are held back, over a known background or over that of the quietest of them."""
+        """Decide about the frames that are held back, over a given background, the known one, or the quietest frame."""
         held, self._warm_up = self._warm_up or [], None
-        levels = [self._background.changing_power(known.spectrum, known.power) for _, known in held]
-        if held:
-            fades_in = len(held) > 1 and _fades_in(self._selected(held[0][0]))
-            quietest = min(levels[1:] if fades_in else levels)
-            self._activity.prime(quietest if floor_power is None else floor_power)
+        if floor_power is not None:
+            self._activity.prime(floor_power)
+        elif held and self._activity.floor_power == 0.0:
+            self._activity.prime(self._quietest(held))
+        return self._decide_all(held, state)
+
+    def _decide_all(self, held: Iterable[tuple[Cut, Measured]], state: FramerState) -> list[Message]:
         return [
-            message
-            for (cut, known), level in zip(held, levels, strict=True)
-            for message in self._decide(cut, known, level, state, active=self._activity.push(level))
+            message for cut, known in held for message in self._decide(cut, known, state, active=self._is_active(known))
         ]
+
+    def _quietest(self, held: Sequence[tuple[Cut, Measured]]) -> float:
+        """Return the lowest level of some frames, without those with dropouts, and the first if the device fades in."""
+        fades_in = len(held) > 1 and _fades_in(self._selected(held[0][0]))
+        settled = [known for _, known in (held[1:] if fades_in else held)]
+        whole = [known for known in settled if self._is_whole(known)]
+        return min(self._level(known) for known in whole or settled)
 
     def backfill(self, first: int, last: int) -> list[Message]:
         """Return the remembered frames from `first` to `last`, both included, whether or not they were sent."""
@@ -190,7 +278,8 @@ class Segmenter:
     def _selected(self, cut: Cut) -> Float32Array:
         return cut.samples[self._channels]
 
-    def _decide(self, cut: Cut, measured: Measured, power: float, state: FramerState, *, active: bool) -> list[Message]:
+    def _decide(self, cut: Cut, measured: Measured, state: FramerState, *, active: bool) -> list[Message]:
+        power = self._background.changing_power(measured.spectrum, measured.power)
         self._recent.append((cut, power))
         self._quiet_frames = 0 if active else self._quiet_frames + 1
         if self._quiet_frames > self._hang_over:
