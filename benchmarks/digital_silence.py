@@ -35,6 +35,9 @@ DROPOUTS_S: Final = (0.2, 1.0, 4.0)
 RINGS_S: Final = (1.0, 2.5, 8.0)
 """Length of a steady ring, in seconds."""
 
+SNRS_DB: Final = (10.0, 20.0)
+"""Ratio of the loudest 50 ms of a sound to the noise, in decibels."""
+
 ROOMS_S: Final = (0.05, 0.7, 2.0)
 """Reverberation times, in seconds, of the sounds without noise."""
 
@@ -156,6 +159,46 @@ def ring_out_of_silence(streams: int, seed: int, length_s: float) -> str:
     return f"| silence, then a steady ring of {length_s:g} s, RT60 0.1 to 2 s | {streams} | {late} | {lost} |"
 
 
+def machine_begins(streams: int, seed: int, background: float) -> str:
+    """Play a machine that begins after 4 s and lasts 10 s; return a row: those that are late or too long, and lost.
+
+    Too long is more than 4.5 s: a steady sound becomes background after 3 s, and its last frames end later.
+    """
+    long = lost = 0
+    for number in range(streams):
+        rng = np.random.default_rng([seed, number])
+        samples = background * noise(rng, 16.0, 1.0)
+        begin = 4 * RATE_HZ
+        machine = noise(rng, 10.0, 10.0 ** (rng.uniform(-50.0, -20.0) / 20.0))[0]
+        for channel, row in enumerate(samples):
+            row[begin + 3 * channel : begin + 3 * channel + len(machine)] += machine
+        active = active_frames(samples)
+        first = begin // FRAME
+        lost += not active[first : first + 200].any()
+        long += not active[first : first + 3].any() or bool(active[first + 90 : first + 200].any())
+    where = "digital silence" if background == 0.0 else "noise"
+    return f"| {where}, then a machine of 10 s | {streams} | {long} | {lost} |"
+
+
+def clips_in_noise(clips: Sequence[Float32Array], streams: int, seed: int, snr_db: float) -> str:
+    """Play sounds in steady noise; return a row: streams whose first sound is lost, and all lost sounds."""
+    first = lost = 0
+    for number in range(streams):
+        rng = np.random.default_rng([seed, number, round(snr_db)])
+        parts, spans = [zeros(3.0)], []
+        for _ in range(CLIPS):
+            clip = np.convolve(clips[int(rng.integers(len(clips)))], 0.3 * decaying(rng, 0.4, 0.4)[0])
+            loudest = max(float(np.square(clip[at : at + FRAME]).mean()) for at in range(0, len(clip), FRAME))
+            begin = sum(part.shape[1] for part in parts)
+            spans.append(slice(begin // FRAME, (begin + len(clip)) // FRAME + 1))
+            parts += [np.tile(clip / np.sqrt(loudest), (4, 1)), zeros(rng.uniform(1.0, 4.0))]
+        samples = np.concatenate(parts, axis=1)
+        active = active_frames(1e-2 * (samples + noise(rng, samples.shape[1] / RATE_HZ, 10.0 ** (-snr_db / 20.0))))
+        missed = [not active[span].any() for span in spans]
+        first, lost = first + missed[0], lost + sum(missed)
+    return f"| {CLIPS} sounds in noise at {snr_db:g} dB | {streams} | {first} | {lost} |"
+
+
 def clips_in_silence(clips: Sequence[Float32Array], streams: int, seed: int, rt60_s: float) -> str:
     """Play sounds with silence between them; return a row: streams whose first sound is lost, and all lost sounds."""
     first = lost = 0
@@ -195,6 +238,10 @@ def main() -> None:
         print(ring_out_of_silence(given.streams, given.seed, length_s), flush=True)
     for rt60_s in ROOMS_S:
         print(clips_in_silence(clips, given.streams, given.seed, rt60_s), flush=True)
+    for background in (0.0, 1e-4):
+        print(machine_begins(given.streams, given.seed, background), flush=True)
+    for snr_db in SNRS_DB:
+        print(clips_in_noise(clips, given.streams, given.seed, snr_db), flush=True)
 
 
 if __name__ == "__main__":

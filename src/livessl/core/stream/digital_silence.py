@@ -39,6 +39,14 @@ _SLOWEST_SOUND_M_S: Final = 300.0
 _CONSTANT: Final = 1e-7
 """Deviation from a constant, full scale, up to which a sample belongs to it: the amplitude of `DIGITAL_SILENCE`."""
 
+_ARRIVED: Final = (1e-2, 2e-2, 4e-2)
+"""Amplitudes, relative to the peak, at which the arrivals of a sound are compared. Below, simulations ring: they
+interpolate between samples."""
+
+_ALIKE: Final = 0.2
+"""Largest difference of these arrivals between the amplitudes, relative to their spread. Noise that fades in reaches
+each amplitude at another time in each channel."""
+
 _END_S: Final = 0.02
 """Length, in seconds, of the end of a sound that is compared with what came before it. In a shorter one, the power of
 low-pitched noise scatters too much."""
@@ -129,22 +137,25 @@ class SilenceEdges:
     def _come_apart(self, samples: Float32Array) -> bool:
         """Return whether channels (K, n) depart from their first samples at different times, as by sound.
 
-        Weak noise of few bits, or noise that fades in, also departs at different times, but then samples are equal to
-        those before them for as long.
+        Weak noise of few bits also departs at different times, but then samples are equal to those before them for as
+        long.
         """
-        departed = np.abs(samples - samples[:, :1]) > _CONSTANT
-        known = np.flatnonzero(departed.any(axis=1))
-        if len(known) < 2:
+        deviation = np.abs(samples - samples[:, :1])
+        live = deviation[deviation.max(axis=1) > _ARRIVED[-1] * deviation.max()]
+        peak = float(deviation.max())
+        if len(live) < 2 or peak <= _CONSTANT:
             return False
-        first = departed[known].argmax(axis=1)
-        apart = int(first.max() - first.min())
-        if not 2 < apart <= self._farthest + 2:
+        arrivals = np.array([(live > max(_CONSTANT, share * peak)).argmax(axis=1) for share in _ARRIVED])
+        apart = int(np.ptp(arrivals, axis=1).min())
+        if apart <= 2 or np.ptp(arrivals, axis=1).max() > self._farthest + 2:
             return False
-        for channel, begin in zip(known.tolist(), first.tolist(), strict=True):
-            begun = samples[channel, begin : begin + self._end]
-            if apart <= 2 + 2 * max((stop - start for start, stop in runs(begun[1:] == begun[:-1])), default=0):
-                return False
-        return True
+        differences = arrivals - arrivals.mean(axis=1, keepdims=True)
+        if np.ptp(differences, axis=0).max() > max(2.0, _ALIKE * apart):
+            return False
+        return all(
+            apart > 2 + 2 * _longest_constant(channel[begin : begin + self._end])
+            for channel, begin in zip(live, arrivals[0].tolist(), strict=True)
+        )
 
     def _falls_fast(self, backwards: Float32Array) -> bool:
         departed = np.flatnonzero((np.abs(backwards - backwards[:, :1]) > _CONSTANT).any(axis=0))
@@ -155,6 +166,11 @@ class SilenceEdges:
         if before.shape[1] < self._end:
             return False
         return bool(_FALLEN * _power(end) <= _power(before))
+
+
+def _longest_constant(samples: FloatArray | Float32Array) -> int:
+    """Return the largest number of consecutive samples (n,) that are equal to the one before them."""
+    return max((stop - start for start, stop in runs(samples[1:] == samples[:-1])), default=0)
 
 
 def _falls_slowly(levels: Sequence[float]) -> bool:

@@ -38,8 +38,12 @@ background. The quietest of them is the first estimate of the background, withou
 there."""
 
 HELD_FRAMES: Final = 8
-"""Number of frames that are still compared for the rest of the background's window, after a warm-up that follows
-digital silence and was steady. A frame is sent 0.35 s late then; at 0.5 s, others no longer wait for it."""
+"""Number of frames that are still compared after a warm-up that follows digital silence and was steady. A frame is sent
+0.35 s late then; at 0.5 s, others no longer wait for it."""
+
+HELD_S: Final = 5.0
+"""Time after digital silence, in seconds, for which they are. Most steady sounds, such as rings of telephones, have
+ended by then."""
 
 FALLEN: Final = 4.0
 """Ratio of the mean level of the oldest held frames to that of the newest, 6 dB, at and above which a steady sound has
@@ -164,19 +168,25 @@ class Segmenter:
         if measured.power < DIGITAL_SILENCE or is_dropout:
             return self._take_silence(cut, measured, state)
         if self._frames_since_silence is not None:
-            self._begin_after_silence()
+            self._begin_after_silence(measured)
             self._frames_since_silence += 1
         return self._take_sound(cut, measured, state)
 
-    def _begin_after_silence(self) -> None:
+    def _begin_after_silence(self, measured: Measured) -> None:
         """Take digital silence for the background if what ends it begins as sound does."""
         if self._frames_since_silence != 0:
             return
         self._edges.begin()
         is_long = self._silent_frames >= LEAST_SILENT_FRAMES
         if is_long and not self._is_silence_background and self._edges.begins_as_sound():
-            self._is_silence_background = True
+            self._trust_silence(measured)
             self._activity, self._warm_up = CausalActivity(self._parameters), None
+            self._activity.prime(0.0)
+
+    def _trust_silence(self, measured: Measured) -> None:
+        """Take digital silence for the background, of which a tone that was all that was learned is not a part."""
+        self._is_silence_background = True
+        self._background.learn_silence(len(measured.spectrum))
 
     def _take_sound(self, cut: Cut, measured: Measured, state: FramerState) -> list[Message]:
         is_whole = self._is_whole(measured)
@@ -212,8 +222,8 @@ class Segmenter:
             ends_as_sound = self._edges.ends_as_sound()
             if not ends_as_sound:
                 self._is_silence_background = False
-            elif since is not None and since <= self._floor_frames:
-                self._is_silence_background = True
+            elif since is not None and since <= self._floor_frames and not was_background:
+                self._trust_silence(measured)
         self._silent_frames = 1 if since != 0 else self._silent_frames + 1
         self._frames_since_silence = 0
         messages: list[Message] = []
@@ -240,7 +250,7 @@ class Segmenter:
         if len(levels) > COMPARED and FALLEN * sum(levels[-COMPARED:]) <= sum(levels[:COMPARED]):
             return self._end_warm_up(state, min(levels))
         begins = max(levels, default=0.0) >= self._parameters.least_power(self._activity.floor_power)
-        if begins or self._frames_since_silence >= self._floor_frames:
+        if begins or self._frames_since_silence * FRAME_S >= HELD_S:
             return self.flush(state)
         decided = 1 + len(held) - HELD_FRAMES
         self._warm_up = held[decided:]

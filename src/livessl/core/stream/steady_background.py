@@ -108,6 +108,11 @@ class SteadyBackground:
         self._learn(spectrum)
         return loud is not self._loud and self._usual_power(self._loud) < NEW_HUM * self._usual_power(loud)
 
+    def learn_silence(self, bins: int) -> None:
+        """Take in as much silence as shows that no bin, of so many, is steady and loud."""
+        for _ in range(_SMOOTHING):
+            self._learn(np.zeros(bins))
+
     def _learn(self, spectrum: FloatArray) -> None:
         self._maximum = np.maximum(self._keep * self._maximum, spectrum)
         self._latest.append(spectrum)
