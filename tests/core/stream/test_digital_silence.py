@@ -15,11 +15,11 @@ from livessl.core.stream.activity import ActivityParameters
 from livessl.core.stream.digital_silence import sound_shares
 from livessl.core.stream.segmenter import Segmenter
 from livessl.core.stream.timeline import Framer
-from livessl.core.types import FRAME_NS, ArraySpec, Block, Float32Array, FloatArray, Frame
+from livessl.core.types import FRAME_NS, FRAME_S, ArraySpec, Block, Float32Array, FloatArray, Frame
 
-FRAME_S: Final = 0.05
 START: Final = 20 * 1_700_000_000
 C_M_S: Final = 343.0
+SPEC: Final = tetra("north", [4.0, 3.0, 1.0], 0.5)
 
 
 def active_s(spec: ArraySpec, samples: FloatArray, rate_hz: float) -> list[float]:
@@ -185,7 +185,7 @@ def test_noise_of_a_driver_that_drops_out_again_and_again_is_no_sound_and_hides_
     samples[:, begin : begin + len(t_s)] += 20.0 * level * rng.standard_normal(len(t_s)) * 10.0 ** (-10.0 * t_s)
     if bits < 32:
         samples = np.round(samples * 2.0 ** (bits - 1)) / 2.0 ** (bits - 1)
-    active = active_s(tetra("north", [4.0, 3.0, 1.0], 0.5), samples, rate_hz)
+    active = active_s(SPEC, samples, rate_hz)
     assert active
     assert begin / rate_hz - FRAME_S <= min(active) <= begin / rate_hz + FRAME_S
 
@@ -206,7 +206,7 @@ def test_burst_between_dropouts_is_found_and_ends(
     begin = round((sum(map(sum, spans_s)) + wait_s) * rate_hz)
     t_s = np.arange(round(0.3 * rate_hz)) / rate_hz
     samples[:, begin : begin + len(t_s)] += 20.0 * level * rng.standard_normal(len(t_s)) * 10.0 ** (-10.0 * t_s)
-    active = active_s(tetra("north", [4.0, 3.0, 1.0], 0.5), samples, rate_hz)
+    active = active_s(SPEC, samples, rate_hz)
     assert after < samples.shape[1]
     assert active
     assert begin / rate_hz - FRAME_S <= min(active) <= begin / rate_hz + FRAME_S
@@ -223,7 +223,7 @@ def test_steady_sounds_of_a_noise_gate_are_all_found(seed: int, release_s: float
     gap = np.zeros(round(2.0 * rate_hz))
     parts = np.concatenate([gap, gain, gap, gain, gap, gap, gain, gap])
     samples = 10.0 ** (level_db / 20.0) * fan(rng, len(parts) / rate_hz, rate_hz, 0.2) * parts
-    active = active_s(tetra("north", [4.0, 3.0, 1.0], 0.5), samples, rate_hz)
+    active = active_s(SPEC, samples, rate_hz)
     for begin_s in (2.0, 5.2 + release_s, 10.4 + 2 * release_s):
         assert any(begin_s <= one < begin_s + 1.2 for one in active)
 
@@ -242,6 +242,25 @@ def test_fan_after_digital_silence_is_no_sound(kind: str) -> None:
         samples = np.round(noise * 2.0**15) / 2.0**15
         spec = tetra("north", [4.0, 3.0, 1.0], 4.0 if kind == "joint" else 0.5)
         assert active_s(spec, samples, rate_hz) == []
+
+
+@pytest.mark.parametrize("silence_s", [0.3, 2.0])
+def test_noise_after_silence_is_late_by_less_than_others_wait_and_in_time_after_five_seconds(silence_s: float) -> None:
+    rate_hz = 16000.0
+    samples = 1e-3 * fan(np.random.default_rng(4), 9.0, rate_hz, 0.5).astype(np.float32)
+    samples[:, : round(silence_s * rate_hz)] = 0.0
+    framer, segmenter = Framer(rate_hz), Segmenter(SPEC, np.arange(4), rate_hz, ActivityParameters())
+    for index in range(samples.shape[1] // 800):
+        block = Block(800 * index, samples[:, 800 * index : 800 * (index + 1)], (START + index) * FRAME_NS)
+        (cut,) = framer.push(block)
+        late = [index - (message.frame_index - START) for message in segmenter.push(cut, framer.state)]
+        since_s = FRAME_S * index - silence_s
+        assert max(late, default=0) < 10
+        assert late or 0.0 <= since_s < 0.5  # the warm-up
+        if 0.5 < since_s < 4.9:
+            assert late == [7]
+        elif since_s > 5.1:
+            assert late == [0]
 
 
 def test_share_of_a_frame_without_dropouts() -> None:

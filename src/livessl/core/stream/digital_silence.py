@@ -1,4 +1,4 @@
-"""Tells sound between digital silences from noise that a driver switches on and off. It reads no clock.
+"""Separates sound between digital silences from noise that a driver switches on and off. It reads no clock.
 
 Digital silence is a constant signal. A driver delivers it until a device runs, and while it drops out. All channels of
 the device then change at the same sample, and the noise is as strong just before the change as it was all the time.
@@ -16,10 +16,10 @@ import numpy as np
 
 from livessl.core.stream.activity import runs
 from livessl.core.stream.timeline import Cut
-from livessl.core.types import BoolArray, Float32Array, FloatArray, IntArray
+from livessl.core.types import FRAME_S, BoolArray, Float32Array, FloatArray, IntArray
 
 DIGITAL_SILENCE: Final = 1e-14
-"""In-band power, full scale squared, below which a frame is digital silence: -140 dBFS. The noise of the best
+"""The in-band power, full scale squared, below which a frame is digital silence: -140 dBFS. The noise of the best
 converters is 15 dB above it; zeros and other constants are below it."""
 
 LEAST_DROPOUT_S: Final = 0.002
@@ -52,15 +52,15 @@ _END_S: Final = 0.02
 low-pitched noise scatters too much."""
 
 _BEFORE_ENDS: Final = 4
-"""Length of what came before it, in multiples of `_END_S`."""
+"""Length of the sound before its end, in multiples of `_END_S`."""
 
 _FALLEN: Final = 100.0
 """Least ratio of the power before the end to that at the end, 20 dB, that shows a fast decay. Rooms with an RT60 of
-0.25 s or less have it; low-pitched noise does not."""
+0.18 s or less have it; low-pitched noise does not."""
 
 _DECAYED: Final = 4.0
-"""Least ratio of the first to the last third of half a second, 6 dB, that shows a slow decay: an RT60
-of up to 3.5 s."""
+"""Least ratio of the first to the last third of half a second, 6 dB, that shows a slow decay: an RT60 of
+up to 3.5 s."""
 
 _DECAYS_STILL: Final = 1.6
 """Least ratio of the second to the last third in a slow decay, 2 dB. Noise is steady again after a short sound."""
@@ -73,10 +73,11 @@ def sound_shares(samples: Float32Array) -> FloatArray:
     """
     count, _, length = samples.shape
     shares = np.ones(count)
-    constant: BoolArray = np.all(samples[:, :, 1:] == samples[:, :, :-1], axis=1)
-    least = round(LEAST_DROPOUT_S / 0.05 * length)
-    for index in np.flatnonzero(np.count_nonzero(constant, axis=1) >= least):
-        gaps = [stop - start for start, stop in runs(constant[index]) if stop - start >= least]
+    least = round(LEAST_DROPOUT_S / FRAME_S * length)
+    first = samples[:, 0]  # most frames have no dropout, and one channel shows it
+    for index in np.flatnonzero(np.count_nonzero(first[:, 1:] == first[:, :-1], axis=1) >= least):
+        constant: BoolArray = np.all(samples[index, :, 1:] == samples[index, :, :-1], axis=0)
+        gaps = [stop - start for start, stop in runs(constant) if stop - start >= least]
         if gaps:
             shares[index] = max(0.0, 1.0 - (sum(gaps) + 1) / length)
     return shares
