@@ -39,6 +39,10 @@ _SLOWEST_SOUND_M_S: Final = 300.0
 _CONSTANT: Final = 1e-7
 """Deviation from a constant, full scale, up to which a sample belongs to it: the amplitude of `DIGITAL_SILENCE`."""
 
+_LEAST_APART_S: Final = 2e-4
+"""Least spread of the arrivals, in seconds, that shows a sound. Noise that is near zero when it is switched is later by
+less in a channel."""
+
 _ARRIVED: Final = (1e-2, 2e-2, 4e-2)
 """Amplitudes, relative to the peak, at which the arrivals of a sound are compared. Below, simulations ring: they
 interpolate between samples."""
@@ -98,6 +102,7 @@ class SilenceEdges:
     def __init__(self, channels: IntArray, aperture_m: float, sample_rate_hz: float) -> None:
         self._channels = channels
         self._end = round(_END_S * sample_rate_hz)
+        self._least_apart = _LEAST_APART_S * sample_rate_hz
         self._farthest = aperture_m / _SLOWEST_SOUND_M_S * sample_rate_hz
         self._cuts: deque[Cut] = deque(maxlen=3)
         self._levels: deque[float] = deque(maxlen=10)
@@ -148,10 +153,10 @@ class SilenceEdges:
             return False
         arrivals = np.array([(live > max(_CONSTANT, share * peak)).argmax(axis=1) for share in _ARRIVED])
         apart = int(np.ptp(arrivals, axis=1).min())
-        if apart <= 2 or np.ptp(arrivals, axis=1).max() > self._farthest + 2:
+        if apart <= self._least_apart or np.ptp(arrivals, axis=1).max() > self._farthest + 2:
             return False
         differences = arrivals - arrivals.mean(axis=1, keepdims=True)
-        if np.ptp(differences, axis=0).max() > max(2.0, _ALIKE * apart):
+        if np.ptp(differences, axis=0).max() > max(1.5, _ALIKE * apart):
             return False
         return all(
             apart > 2 + 2 * _longest_constant(channel[begin : begin + self._end])
