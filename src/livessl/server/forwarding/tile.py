@@ -1,0 +1,78 @@
+"""Decides which events of a server in a hall go to the hub: those of its own tile, and those near it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, Final
+
+import numpy as np
+
+from livessl.core.types import Status
+from livessl.server.history.query import JsonObject
+from livessl.site import polygon
+from livessl.site.hall import hall_of, neighbourhood
+from livessl.site.models import Site
+
+MARGIN_M: Final = 1.0
+"""Least distance, in metres, from the tile up to which an event is sent: twice the error of 0.5 m that its confidence
+is about, for positions whose covariance is too small."""
+
+MARGIN_STD: Final = 3.0
+"""The same distance in standard deviations of the position, in the direction in which it is least certain."""
+
+
+class Tile:
+    """The tile of a server.
+
+    Every server of a hall receives arrays of its neighbours, and so locates sounds deep in their tiles, with the few
+    arrays that it has there. It does not send these. An event without a sure position is sent if an array of the tile
+    detected it.
+
+    Parameters
+    ----------
+    hall : str
+        Name of the hall.
+    corners_m : sequence of (float, float)
+        Corners of the tile, in metres.
+    own : frozenset of str
+        Names of the arrays in the tile.
+    """
+
+    def __init__(self, hall: str, corners_m: Sequence[polygon.Point], own: frozenset[str]) -> None:
+        self.hall = hall
+        self._corners_m = corners_m
+        self._own = own
+
+    @classmethod
+    def of(cls, site: Site) -> Tile | None:
+        """Return the tile of a site; None for a site that has its room to itself."""
+        hall = hall_of(site)
+        return None if hall is None else cls(hall.name, hall.tile_m, frozenset(neighbourhood(site, hall).own))
+
+    def sent(self, event: JsonObject) -> JsonObject | None:
+        """Return an event as the hub gets it, with its hall; None if it belongs to a neighbour alone.
+
+        Parameters
+        ----------
+        event : JsonObject
+            A final event, as the API has it.
+        """
+        outside_m = None if event["position_m"] is None else self._outside_m(event["position_m"])
+        if event["status"] == Status.LOCATED and outside_m is not None:
+            is_wanted = outside_m <= max(MARGIN_M, MARGIN_STD * _horizontal_std_m(event["covariance_m2"]))
+        else:
+            heard_by = event.get("heard_by") or ()
+            is_wanted = not heard_by or not self._own.isdisjoint(heard_by) or outside_m == 0.0
+        return {**event, "hall": {"name": self.hall, "in_tile": outside_m == 0.0}} if is_wanted else None
+
+    def _outside_m(self, position_m: Sequence[float]) -> float:
+        return polygon.distance_m(self._corners_m, position_m[0], position_m[1])
+
+
+def _horizontal_std_m(covariance_m2: Any) -> float:
+    """Return the largest standard deviation of a position on the floor plan, in metres; 0 if it is not known."""
+    if covariance_m2 is None:
+        return 0.0
+    variances_m2 = np.linalg.eigvalsh(np.asarray(covariance_m2, dtype=float)[:2, :2])
+    return math.sqrt(max(0.0, float(variances_m2[-1])))
