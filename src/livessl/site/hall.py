@@ -44,6 +44,12 @@ def hall_faults(site: Site) -> Iterator[Finding]:
             here: Place = ("nodes", name, "further_servers", number)
             if further.server in node.endpoints[: number + 1]:
                 yield (*here, "server"), f"expected each server once, got {further.server!r} again; remove it"
+            if further.public_key is not None and site.keys is None:
+                yield (
+                    (*here, "public_key"),
+                    "expected keys as well, the folder with the node's own keys, got none; add keys: keys, or remove "
+                    "public_key: without keys nothing is encrypted",
+                )
             for array in further.arrays or ():
                 if array not in node.arrays:
                     yield (
