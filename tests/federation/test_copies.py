@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from itertools import permutations
+from threading import Thread
 from typing import Any
 
 import pytest
@@ -17,6 +18,7 @@ from livessl.federation.schema import SiteEvent
 from livessl.federation.storing import Delivery
 from livessl.server.api.encode import JsonObject
 from livessl.server.history.query import Query
+from small_site import HANG_S
 
 PATIENCE_S = 3.0
 HERE, NEAR, FAR = (2.0, 2.0, 1.0), (2.1, 2.0, 1.0), (3.5, 4.0, 1.0)
@@ -38,7 +40,9 @@ def take(archive: Archive, *deliveries: Delivery) -> None:
 
 def found(archive: Archive, limit: int = 1000, **query: Any) -> list[JsonObject]:
     """Events by their ids."""
-    return sorted((row.event for row in archive.store.page(Query(limit=limit, **query)).rows), key=lambda event: str(event["id"]))
+    return sorted(
+        (row.event for row in archive.store.page(Query(limit=limit, **query)).rows), key=lambda event: str(event["id"])
+    )
 
 
 def shown(archive: Archive, **query: Any) -> list[str]:
@@ -139,7 +143,9 @@ def test_an_event_that_comes_after_hours_of_others_finds_its_copy(archive: Archi
 def test_a_backlog_of_one_server_is_matched_in_one_transaction(archive: Archive) -> None:
     def of(site: str, number: int) -> Delivery:
         moved = (2.0 + 0.05 * (site == "east"), 2.0, 1.0)
-        return delivered(site, number + 1, hall_event(f"{site}-{number}", moved, in_tile=site == "west", at_s=90.0 * number))
+        return delivered(
+            site, number + 1, hall_event(f"{site}-{number}", moved, in_tile=site == "west", at_s=90.0 * number)
+        )
 
     take(archive, *(of("west", number) for number in range(150)))
     take(archive, *(of("east", number) for number in range(150)))
@@ -163,6 +169,30 @@ def test_a_message_that_cannot_be_compared_is_left_out_alone(archive: Archive) -
     taken = archive.take([delivered("west", 1, hall_event("w", HERE)), delivered("east", 1, broken)], PATIENCE_S)
     assert ([each.site for each in taken.done], [each.site for each in taken.rejected]) == (["west"], ["east"])
     assert marks(archive) == {"w": (None, [])}
+
+
+def test_two_hubs_that_store_at_the_same_time_miss_no_copy(place: DatabasePlace) -> None:
+    """As for a moment when one hub takes over from another that has lost its connection."""
+    assert place is not None
+    count = 40
+    hubs = {site: Archive(place, SystemClock()) for site in ("west", "east")}
+
+    def store(site: str) -> None:
+        for number in range(count):
+            event = hall_event(
+                f"{site[0]}-{number}", HERE if site == "west" else NEAR, in_tile=site == "west", at_s=5.0 * number
+            )
+            take(hubs[site], delivered(site, number + 1, event))
+
+    threads = [Thread(target=store, args=(site,)) for site in hubs]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(timeout=HANG_S)
+    assert shown(hubs["east"]) == sorted(f"w-{number}" for number in range(count))
+    assert len(found(hubs["west"])) == 2 * count
+    for archive in hubs.values():
+        archive.close()
 
 
 def test_copies_are_deleted_with_the_events_that_are_shown(archive: Archive) -> None:

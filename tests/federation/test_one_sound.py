@@ -73,7 +73,11 @@ def test_a_short_sound_that_reaches_the_arrays_of_one_server_a_frame_later_is_on
 def test_parts_of_a_lasting_sound_are_joined_to_the_part_that_they_overlap_most() -> None:
     """Two servers that cut a lasting sound half a second apart do not chain all parts together."""
     assert LEAST_OVERLAP == 0.5
-    parts = [seen(site, at_s=10.0 * n + late, for_s=10.0, number=n) for site, late in (("a", 0.0), ("b", 0.5)) for n in range(4)]
+    parts = [
+        seen(site, at_s=10.0 * n + late, for_s=10.0, number=n)
+        for site, late in (("a", 0.0), ("b", 0.5))
+        for n in range(4)
+    ]
     assert named(sounds(parts)) == [["a", "b"], ["a1", "b1"], ["a2", "b2"], ["a3", "b3"]]
 
 
@@ -217,7 +221,12 @@ def test_each_event_is_in_one_sound_which_has_one_event_of_each_server_at_most(e
 def test_sounds_that_are_not_connected_do_not_change_each_other(events: list[Sighting]) -> None:
     """So a hub may decide about the events that are connected with a new one, and look at no others."""
     far = [
-        replace(event, name=Name(event.name.site, f"{event.name.id}-far"), start_ns=later(event.start_ns), end_ns=later(event.end_ns))
+        replace(
+            event,
+            name=Name(event.name.site, f"{event.name.id}-far"),
+            start_ns=later(event.start_ns),
+            end_ns=later(event.end_ns),
+        )
         for event in events
     ]
     assert named(sounds([*events, *far])) == sorted(named(sounds(events)) + named(sounds(far)))

@@ -22,6 +22,7 @@ import numpy as np
 
 from livessl.clock import utc_ns
 from livessl.core.types import FloatArray, Status
+from livessl.server.forwarding.whereabouts import whereabouts
 from livessl.server.history.query import JsonObject
 
 SAME_PLACE: Final = 11.3
@@ -40,14 +41,11 @@ LEAST_SHARED: Final = 0.5
 """Least share of arrays that detected both of two events, of which one is refused, among those of the one that fewer
 arrays detected."""
 
-DISTANCE_STD: Final = 0.5
-"""Standard deviation of the distance from the nearest array, as a share of it, if an event has a direction only."""
-
 ROUNDING_M2: Final = 1e-6
 """Variance, in square metres, that is added to each position: that of a millimetre, as events are rounded."""
 
-_RANKS: Final = {Status.LOCATED: 0, Status.DIRECTION_ONLY: 1}
-_REFUSED: Final = 2
+_RANKS: Final = {Status.LOCATED: 0, Status.DIRECTION_ONLY: 1, Status.REFUSED: 2}
+_REFUSED: Final = _RANKS[Status.REFUSED]
 
 
 class Name(NamedTuple):
@@ -103,21 +101,14 @@ def sighting(event: JsonObject) -> Sighting:
         As a hub stores it, with `site` and `hall`.
     """
     start_ns = utc_ns(event["time_utc"])
-    position_m, covariance_m2 = event.get("position_m"), event.get("covariance_m2")
-    has_place = position_m is not None and covariance_m2 is not None
-    rank = _RANKS.get(event["status"], _REFUSED) if has_place else _REFUSED
-    places_m, spread_m2 = np.empty((0, 3)), np.eye(3)
-    if rank != _REFUSED:
-        candidates = [each["position_m"] for each in event.get("candidates") or ()] if rank else []
-        places_m = np.array(candidates or [position_m], dtype=float)
-        spread_m2 = _covariance_m2(covariance_m2) + (_along_the_sight_m2(event) if rank else 0.0)
+    status, places_m, covariance_m2 = whereabouts(event)
     return Sighting(
         name=Name(event["site"], event["id"]),
         start_ns=start_ns,
         end_ns=start_ns + round(1e9 * (event.get("duration_s") or 0.0)),
-        rank=rank,
+        rank=_RANKS[status],
         places_m=places_m,
-        covariance_m2=spread_m2,
+        covariance_m2=covariance_m2,
         in_tile=bool(event["hall"]["in_tile"]),
         heard_by=frozenset(event.get("heard_by") or ()),
     )
@@ -186,21 +177,3 @@ def sounds(events: Sequence[Sighting]) -> list[list[Sighting]]:
             group_of[event.name] = one
     groups = {id(group): group for group in group_of.values()}.values()
     return [sorted(group, key=lambda each: each.merit) for group in groups]
-
-
-def _covariance_m2(values: Any) -> FloatArray:
-    """Return a covariance without negative variances, which rounding may cause."""
-    given = np.asarray(values, dtype=float)
-    variances_m2, axes = np.linalg.eigh((given + given.T) / 2.0)
-    return np.asarray((axes * np.maximum(variances_m2, 0.0)) @ axes.T)
-
-
-def _along_the_sight_m2(event: JsonObject) -> FloatArray:
-    """Return the covariance of a distance that is not known, along the line from the nearest array that contributed."""
-    seen = min(event.get("contributions") or (), key=lambda each: each["distance_m"], default=None)
-    if seen is None:
-        return np.zeros((3, 3))
-    azimuth, elevation = math.radians(seen["azimuth_deg"]), math.radians(seen["elevation_deg"])
-    level = math.cos(elevation)
-    sight = np.array([level * math.cos(azimuth), level * math.sin(azimuth), math.sin(elevation)])
-    return np.outer(sight, sight) * (DISTANCE_STD * seen["distance_m"]) ** 2

@@ -93,7 +93,9 @@ class SiteEvent(Event):
         "shown itself.",
     )
     copies: list[EventName] = Field(
-        default=[], description="Events of neighbouring servers that are the same sound, and are not shown.", examples=[[]]
+        default=[],
+        description="Events of neighbouring servers that are the same sound, and are not shown.",
+        examples=[[]],
     )
 
 

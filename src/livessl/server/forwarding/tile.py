@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
-from livessl.core.types import Status
+from livessl.core.types import FloatArray, Status
+from livessl.server.forwarding.whereabouts import whereabouts
 from livessl.server.history.query import JsonObject
 from livessl.site import polygon
 from livessl.site.hall import hall_of, neighbourhood
@@ -26,8 +27,8 @@ class Tile:
     """The tile of a server.
 
     Every server of a hall receives arrays of its neighbours, and so locates sounds deep in their tiles, with the few
-    arrays that it has there. It does not send these. An event without a sure position is sent if an array of the tile
-    detected it.
+    arrays that it has there. It does not send these. A refused event has no position, and is sent if an array of the
+    tile detected it.
 
     Parameters
     ----------
@@ -58,21 +59,20 @@ class Tile:
         event : JsonObject
             A final event, as the API has it.
         """
-        outside_m = None if event["position_m"] is None else self._outside_m(event["position_m"])
-        if event["status"] == Status.LOCATED and outside_m is not None:
-            is_wanted = outside_m <= max(MARGIN_M, MARGIN_STD * _horizontal_std_m(event["covariance_m2"]))
-        else:
+        found = whereabouts(event)
+        if found.status == Status.REFUSED:
             heard_by = event.get("heard_by") or ()
-            is_wanted = not heard_by or not self._own.isdisjoint(heard_by) or outside_m == 0.0
-        return {**event, "hall": {"name": self.hall, "in_tile": outside_m == 0.0}} if is_wanted else None
+            is_wanted = not heard_by or not self._own.isdisjoint(heard_by)
+        else:
+            margin_m = max(MARGIN_M, MARGIN_STD * _horizontal_std_m(found.covariance_m2))
+            is_wanted = any(self._outside_m(place_m) <= margin_m for place_m in found.places_m)
+        in_tile = event["position_m"] is not None and self._outside_m(event["position_m"]) == 0.0
+        return {**event, "hall": {"name": self.hall, "in_tile": in_tile}} if is_wanted else None
 
-    def _outside_m(self, position_m: Sequence[float]) -> float:
-        return polygon.distance_m(self._corners_m, position_m[0], position_m[1])
+    def _outside_m(self, place_m: Sequence[float] | FloatArray) -> float:
+        return polygon.distance_m(self._corners_m, float(place_m[0]), float(place_m[1]))
 
 
-def _horizontal_std_m(covariance_m2: Any) -> float:
-    """Return the largest standard deviation of a position on the floor plan, in metres; 0 if it is not known."""
-    if covariance_m2 is None:
-        return 0.0
-    variances_m2 = np.linalg.eigvalsh(np.asarray(covariance_m2, dtype=float)[:2, :2])
-    return math.sqrt(max(0.0, float(variances_m2[-1])))
+def _horizontal_std_m(covariance_m2: FloatArray) -> float:
+    """Return the largest standard deviation of a position on the floor plan, in metres."""
+    return math.sqrt(max(0.0, float(np.linalg.eigvalsh(covariance_m2[:2, :2])[-1])))
