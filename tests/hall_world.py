@@ -51,9 +51,7 @@ def site_data(name: str, urls: Sequence[str]) -> dict[str, Any]:
         "room": {"size_m": list(HALL_M)},
         "grid": {"spacing_m": 0.25, "bounds_m": bounds},
         "arrays": {array: _array(array) for array in SEEN[name]},
-        "nodes": {
-            node: _node(node, [array for array in arrays if array in SEEN[name]]) for node, arrays in OF_NODES.items()
-        },
+        "nodes": {node: _node([array for array in arrays if array in SEEN[name]]) for node, arrays in OF_NODES.items()},
         "server": {
             "bind": "tcp://127.0.0.1:*",
             "http": {"host": "127.0.0.1", "port": 0},
@@ -71,7 +69,7 @@ def _array(name: str) -> dict[str, Any]:
     return {"geometry": {"tetrahedron": {"edge_m": 0.3}}, "position_m": list(ARRAYS[name])}
 
 
-def _node(node: str, arrays: Sequence[str]) -> dict[str, Any]:
+def _node(arrays: Sequence[str]) -> dict[str, Any]:
     channels = {array: list(range(4 * n + 1, 4 * n + 5)) for n, array in enumerate(arrays)}
     return {
         "device": {"name": "UMC1820", "sample_rate_hz": RATE_HZ},
@@ -98,7 +96,7 @@ def node_site(node: str, endpoints: Mapping[str, str], directory: Path | None = 
     other = next(name for name in TILES if name != own)
     data = site_data(own, ["nats://127.0.0.1:4222"])
     data["arrays"] = {array: _array(array) for array in OF_NODES[node]}
-    data["nodes"] = {node: _node(node, OF_NODES[node])}
+    data["nodes"] = {node: _node(OF_NODES[node])}
     shared = [array for array in OF_NODES[node] if array in SEEN[other]]
     data["nodes"][node] |= {
         "server": endpoints[own],

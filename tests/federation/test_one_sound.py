@@ -220,18 +220,11 @@ def test_each_event_is_in_one_sound_which_has_one_event_of_each_server_at_most(e
 @given(crowds())
 def test_sounds_that_are_not_connected_do_not_change_each_other(events: list[Sighting]) -> None:
     """So a hub may decide about the events that are connected with a new one, and look at no others."""
-    far = [
-        replace(
-            event,
-            name=Name(event.name.site, f"{event.name.id}-far"),
-            start_ns=later(event.start_ns),
-            end_ns=later(event.end_ns),
-        )
-        for event in events
-    ]
+    far = [moved(event) for event in events]
     assert named(sounds([*events, *far])) == sorted(named(sounds(events)) + named(sounds(far)))
 
 
-def later(time_ns: int) -> int:
-    """The time an hour later."""
-    return time_ns + 3600 * SECOND_NS
+def moved(event: Sighting) -> Sighting:
+    """The same event an hour later, under another name."""
+    hour_ns, name = 3600 * SECOND_NS, Name(event.name.site, f"{event.name.id}-far")
+    return replace(event, name=name, start_ns=event.start_ns + hour_ns, end_ns=event.end_ns + hour_ns)

@@ -94,4 +94,4 @@ def _tile_in_words(site: Site) -> Iterator[str]:
         f"hall {hall.name!r}: this server's tile has {abs(signed_area_m2(hall.tile_m)):g} m2, with the arrays "
         f"{', '.join(own) or 'none'}; its neighbours' arrays: {', '.join(neighbours) or 'none'}"
     )
-    yield "the hub gets its events in the tile and near it; a sound that a neighbour locates as well is shown once there"
+    yield "the hub gets its events in and near the tile, and shows a sound that a neighbour locates as well once"
