@@ -2,11 +2,11 @@
 
     python benchmarks/hall.py --sounds 200 --rt60 0.7
 
-A hall of 16 x 12 x 5 m has twelve arrays, one every 4 m, and a border through its middle. Each server gets its own six
-arrays and the three next to the border. Half of the sounds are anywhere, half within a metre of the border. Arrays are
-off their places by the uncertainty that a site file assumes. Each server locates what its arrays record. Counted is what
-it sends to the hub, what the hub takes for one sound, and what one server with all arrays finds. The exit status is 1 if
-a sound that one server with all arrays locates is not shown at all.
+A hall of 16 x 12 x 5 m has twelve arrays, one every 4 m, and a border through its middle. Each server gets its own
+six arrays and the three next to the border. Half of the sounds are anywhere, half within a metre of the border. Arrays
+are off their places by the uncertainty that a site file assumes. Each server locates what its arrays record. Counted is
+what it sends to the hub, what the hub takes for one sound, and what one server with all arrays finds. The exit status
+is 1 if a sound that one server with all arrays locates is not shown at all.
 """
 
 from __future__ import annotations
@@ -49,8 +49,17 @@ TILES: Final = {"west": (0.0, BORDER_M), "east": (BORDER_M, HALL_M[0])}
 
 
 class Shown(NamedTuple):
-    """Outcome of one sound: the number of events that both servers sent, the sounds that a hub makes of them, and the
-    events of one server that has all arrays."""
+    """Outcome of one sound.
+
+    Parameters
+    ----------
+    sent : int
+        Number of events that both servers sent.
+    groups : list of list of Sighting
+        The sounds that a hub shows, each with its events.
+    alone : list of Event
+        Events of one server that has all arrays.
+    """
 
     sent: int
     groups: list[list[Sighting]]

@@ -1,4 +1,4 @@
-"""Decides which events of a server in a hall go to the hub: those of its own tile, and those near it."""
+"""Decides which events of a server in a hall are its own concern: those of its tile, and those near it."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ class Tile:
     """The tile of a server.
 
     Every server of a hall receives arrays of its neighbours, and so locates sounds deep in their tiles, with the few
-    arrays that it has there. It does not send these. A refused event has no position, and is sent if an array of the
-    tile detected it.
+    arrays that it has there. It neither sends these to the hub nor alerts about them, unless a rule names zones. A
+    refused event has no position, and concerns the tile if one of its arrays detected it.
 
     Parameters
     ----------
@@ -51,23 +51,27 @@ class Tile:
         hall = hall_of(site)
         return None if hall is None else cls(hall.name, hall.tile_m, frozenset(neighbourhood(site, hall).own))
 
-    def sent(self, event: JsonObject) -> JsonObject | None:
-        """Return an event as the hub gets it, with its hall; None if it belongs to a neighbour alone.
+    def concerns(self, event: JsonObject) -> bool:
+        """Return whether an event is in the tile or near it; else it is its neighbours' alone.
 
         Parameters
         ----------
         event : JsonObject
-            A final event, as the API has it.
+            As the API has it.
         """
         found = whereabouts(event)
         if found.status == Status.REFUSED:
             heard_by = event.get("heard_by") or ()
-            is_wanted = not heard_by or not self._own.isdisjoint(heard_by)
-        else:
-            margin_m = max(MARGIN_M, MARGIN_STD * _horizontal_std_m(found.covariance_m2))
-            is_wanted = any(self._outside_m(place_m) <= margin_m for place_m in found.places_m)
+            return not heard_by or not self._own.isdisjoint(heard_by)
+        margin_m = max(MARGIN_M, MARGIN_STD * _horizontal_std_m(found.covariance_m2))
+        return any(self._outside_m(place_m) <= margin_m for place_m in found.places_m)
+
+    def sent(self, event: JsonObject) -> JsonObject | None:
+        """Return a final event as the hub gets it, with its hall; None if it does not concern the tile."""
+        if not self.concerns(event):
+            return None
         in_tile = event["position_m"] is not None and self._outside_m(event["position_m"]) == 0.0
-        return {**event, "hall": {"name": self.hall, "in_tile": in_tile}} if is_wanted else None
+        return {**event, "hall": {"name": self.hall, "in_tile": in_tile}}
 
     def _outside_m(self, place_m: Sequence[float] | FloatArray) -> float:
         return polygon.distance_m(self._corners_m, float(place_m[0]), float(place_m[1]))
