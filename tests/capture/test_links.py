@@ -189,6 +189,17 @@ def test_what_a_server_missed_waits_in_its_own_folder_for_the_next_run_of_the_no
     ]
 
 
+def test_frames_for_a_server_that_is_no_longer_named_are_reported(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "spool" / "lab-pc@gone.example_5570").mkdir(parents=True)
+    with server() as one, server() as other:
+        capture(node_site(one.receiver.endpoint, other.receiver.endpoint, tmp_path), "run-1")
+    said = [record.getMessage() for record in caplog.records if "further_servers" in record.getMessage()]
+    assert len(said) == 1
+    assert "lab-pc@gone.example_5570; delete the folder" in said[0]
+
+
 @pytest.mark.parametrize(
     ("further", "wanted"),
     [

@@ -140,6 +140,19 @@ def test_an_event_that_comes_after_hours_of_others_finds_its_copy(archive: Archi
     assert len(found(archive, copies=False)) == 300
 
 
+@pytest.mark.parametrize("long_first", [True, False])
+def test_a_short_event_and_a_long_one_that_holds_it_find_each_other(archive: Archive, long_first: bool) -> None:
+    """Whichever comes first, although minutes of others lie between their starts, or their ends, and the new event."""
+    lasting = {**hall_event("w", HERE, at_s=100.0), "duration_s": 50.0}
+    short = hall_event("e", NEAR, in_tile=False, at_s=110.0)
+    pair = [("west", lasting), ("east", short)]
+    others = [("north", hall_event(f"n-{number}", FAR, at_s=10.0 * number)) for number in range(60)]
+    take(archive, *in_order(others))
+    for delivery in in_order(pair if long_first else pair[::-1]):
+        take(archive, delivery)
+    assert (marks(archive)["w"], marks(archive)["e"]) == ((None, [name("east", "e")]), (name("west", "w"), []))
+
+
 def test_a_backlog_of_one_server_is_matched_in_one_transaction(archive: Archive) -> None:
     def of(site: str, number: int) -> Delivery:
         moved = (2.0 + 0.05 * (site == "east"), 2.0, 1.0)

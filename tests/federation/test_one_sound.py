@@ -166,7 +166,12 @@ def test_an_event_is_read_as_a_hub_stores_it() -> None:
         "hall": {"name": "works", "in_tile": True},
     }
     read = sighting(stored)
-    assert (read.name, read.rank, read.in_tile, read.heard_by) == (Name("a", "a-1"), DIRECTION, True, {"west"})
+    assert (read.name, read.rank, read.in_tile, read.heard_by) == (
+        Name("a", "a-1"),
+        DIRECTION,
+        True,
+        frozenset(("west",)),
+    )
     assert (read.start_ns, read.end_ns) == (START_NS + 50_000_000, START_NS + 900_000_000)
     assert np.diag(read.covariance_m2) == pytest.approx([0.01, 4.01, 0.01])  # 2 m along the line of sight
     refused = sighting({**stored, "status": "refused", "position_m": None, "covariance_m2": None})

@@ -23,8 +23,8 @@ TILE = Tile("works", CORNERS, frozenset(("north",)))
 def event(
     position_m: Sequence[float] | None, heard_by: Sequence[str] = ("north", "south"), **changes: Any
 ) -> JsonObject:
-    status = {"status": Status.REFUSED} if position_m is None else {}
-    return {**encoded(sound(position_m=position_m, **status, **changes)), "heard_by": list(heard_by)}
+    changed = {**({"status": Status.REFUSED} if position_m is None else {}), **changes}
+    return {**encoded(sound(position_m=position_m, **changed)), "heard_by": list(heard_by)}
 
 
 @pytest.mark.parametrize(

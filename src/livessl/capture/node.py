@@ -211,10 +211,26 @@ def _links(site: Site, name: str, pipelines: Sequence[Pipeline], clock: Clock, r
     config, encode = site.nodes[name], EncodeOnce()
     links = [_link(site, name, config.server, pipelines, clock, run_id, _spool(site, name, name, encode))]
     for further in config.further_servers:
-        folder = f"{name}@{re.sub('[^A-Za-z0-9.-]+', '_', further.server.removeprefix('tcp://'))}"
-        spool = _spool(site, name, folder, encode)
+        spool = _spool(site, name, _folder(name, further), encode)
         links.append(_link(site, name, further.server, pipelines, clock, run_id, spool, further=further))
+    _warn_of_abandoned_spools(site, name)
     return Links(links)
+
+
+def _folder(name: str, further: FurtherServer) -> str:
+    """Return the name of the spool's folder for a further server; no node can have it as its own name."""
+    return f"{name}@{re.sub('[^A-Za-z0-9.-]+', '_', further.server.removeprefix('tcp://'))}"
+
+
+def _warn_of_abandoned_spools(site: Site, name: str) -> None:
+    """Log the folders whose server the site file no longer names: their sound is never sent, and stays there."""
+    config = site.nodes[name]
+    if config.spool.directory is None:
+        return
+    wanted = {_folder(name, further) for further in config.further_servers}
+    for folder in site.file(config.spool.directory).glob(f"{name}@*"):
+        if folder.name not in wanted:
+            _log.warning("no server of nodes.%s.further_servers gets the frames in %s; delete the folder", name, folder)
 
 
 def _spool(site: Site, name: str, folder: str, encode: Callable[[Frame], bytes]) -> Spool:

@@ -1,18 +1,19 @@
 """Marks the events of a hall that are copies of others, in the transaction that stores the last event of a sound.
 
 An event of a hall has `copy_of`, the event that is shown instead of it, or `copies`, the events that it is shown for.
-A tag of the kind `flag` keeps copies out of searches, and one of the kind `hall` finds the events of a hall by time.
+A tag of the kind `flag` keeps copies out of searches. One of the kind `hall`, whose time is the end of the event, finds
+the events of a hall that overlap with a new one; those that come at once after their end are the last ones.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Iterator, Sequence, Set
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from itertools import groupby
 from typing import Any, Final, NamedTuple
 
 import orjson
-from sqlalchemy import Connection, and_, bindparam, delete, insert, or_, select, text, update
+from sqlalchemy import ColumnElement, Connection, and_, bindparam, delete, insert, or_, select, text, update
 
 from livessl.federation.one_sound import SLACK_NS, Name, Sighting, pairs, sighting, sounds
 from livessl.server.api.encode import JsonObject
@@ -22,7 +23,7 @@ LOCK: Final = 0x11_7E_55_3
 """Number of the PostgreSQL lock of a transaction that stores events of halls, so that none misses those of another."""
 
 LONGEST_NS: Final = 60_000_000_000
-"""Longest event, in nanoseconds, that a site file allows. Events that are longer are found by their first part."""
+"""Longest event, in nanoseconds, that a site file allows. A longer one may not be found by one that ends before it."""
 
 MOST_TOGETHER: Final = 1000
 """Most events that are compared with each other to place a new one. Sounds that follow each other without a pause, and
@@ -39,6 +40,7 @@ _UNFLAG: Final = delete(tags).where(
 _log = logging.getLogger(__name__)
 
 Span = tuple[int, int]
+"""A time from which on events end, and one until which they begin, in nanoseconds."""
 
 
 class _Stored(NamedTuple):
@@ -52,6 +54,20 @@ class _Stored(NamedTuple):
 def as_stored(message: JsonObject) -> JsonObject:
     """Return an event as a hub stores it first: one of a hall is a copy of none."""
     return {**message, "copy_of": None, "copies": []} if message.get("hall") else message
+
+
+def hall_tags(message: JsonObject, row: Mapping[str, Any]) -> Iterator[JsonObject]:
+    """Yield the tag by which an event of a hall is found, if it is one.
+
+    Parameters
+    ----------
+    message : JsonObject
+        The event.
+    row : mapping of str to Any
+        The columns of a tag of this event, without kind and name.
+    """
+    if message.get("hall"):
+        yield {**row, "kind": "hall", "name": _hall(message), "time_ns": sighting(message).end_ns}
 
 
 def lock_halls(connection: Connection) -> None:
@@ -129,16 +145,21 @@ def _overlapping(connection: Connection, hall: str, searched: Iterable[Sighting]
     spans = _joined(searched)
     for begin in range(0, len(spans), SPANS_AT_ONCE):
         some = spans[begin : begin + SPANS_AT_ONCE]
-        within = or_(*(and_(tags.c.time_ns >= first, tags.c.time_ns <= last) for first, last in some))
-        for row in connection.execute(query.where(within)):
+        for row in connection.execute(query.where(or_(*map(_is_within, some)))):
             message = orjson.loads(row.body)
             yield _Stored(row, message, sighting(message))
 
 
+def _is_within(span: Span) -> ColumnElement[bool]:
+    """Return the condition that an event overlaps with a span."""
+    first, last = span
+    return and_(tags.c.time_ns >= first, tags.c.time_ns <= last + LONGEST_NS, events.c.time_ns <= last)
+
+
 def _joined(searched: Iterable[Sighting]) -> list[Span]:
-    """Return the spans in which events begin that may overlap with some, those that meet as one."""
+    """Return the spans in which events may overlap with some, those that meet as one."""
     joined: list[Span] = []
-    for first, last in sorted((seen.start_ns - LONGEST_NS, seen.end_ns + SLACK_NS) for seen in searched):
+    for first, last in sorted((seen.start_ns - SLACK_NS, seen.end_ns + SLACK_NS) for seen in searched):
         if joined and first <= joined[-1][1]:
             joined[-1] = joined[-1][0], max(last, joined[-1][1])
         else:

@@ -57,7 +57,7 @@ class Name(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sighting:
-    """What one server has found of a sound.
+    """A sound as one server has found it.
 
     Parameters
     ----------
@@ -163,8 +163,9 @@ def sounds(events: Sequence[Sighting]) -> list[list[Sighting]]:
         Different events of one hall.
     """
     group_of = {event.name: [event] for event in events}
-    ordered = sorted(
-        ((max(one.rank, other.rank), found, *sorted((one.name, other.name))) for one, other, found in pairs(events)),
+    ordered: list[tuple[int, float, Name, Name]] = sorted(
+        (max(one.rank, other.rank), found, min(one.name, other.name), max(one.name, other.name))
+        for one, other, found in pairs(events)
     )
     for level, _, first, second in ordered:
         one, other = group_of[first], group_of[second]

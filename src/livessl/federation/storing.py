@@ -10,7 +10,7 @@ import orjson
 from sqlalchemy import Connection, Table, bindparam, delete, insert, select
 
 from livessl.clock import utc_ns
-from livessl.federation.copies import as_stored, lock_halls, mark_copies
+from livessl.federation.copies import as_stored, hall_tags, lock_halls, mark_copies
 from livessl.federation.received import RECEIVED
 from livessl.server.api.encode import JsonObject
 from livessl.server.forwarding.stream import Place
@@ -152,8 +152,8 @@ def _put_events(connection: Connection, messages: Sequence[JsonObject]) -> None:
         message, row = known_as[key], rows[key]
         tags += history.tag_rows(message, row, number)
         compared = {name: row[name] for name in ("time_ns", "confidence", "status", "level_dbfs")}
-        named = {"site": message["site"], **({"hall": message["hall"]["name"]} if message.get("hall") else {})}
-        tags += ({"kind": kind, "name": name, "number": number, **compared} for kind, name in named.items())
+        tags.append({"kind": "site", "name": message["site"], "number": number, **compared})
+        tags += hall_tags(message, {"number": number, **compared})
     connection.execute(insert(history.tags), tags)
     mark_copies(connection, [known_as[key] for key in rows])
 

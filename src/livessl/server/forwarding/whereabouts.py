@@ -1,4 +1,4 @@
-"""Where the sound of an event may have been: its position or candidates, and how certain they are."""
+"""Reads the places of an event: its position or candidates, and how certain they are."""
 
 from __future__ import annotations
 
@@ -67,4 +67,4 @@ def _along_the_sight_m2(event: JsonObject) -> FloatArray:
     azimuth, elevation = math.radians(seen["azimuth_deg"]), math.radians(seen["elevation_deg"])
     level = math.cos(elevation)
     sight = np.array([level * math.cos(azimuth), level * math.sin(azimuth), math.sin(elevation)])
-    return np.outer(sight, sight) * (DISTANCE_STD * seen["distance_m"]) ** 2
+    return np.asarray(np.outer(sight, sight) * (DISTANCE_STD * seen["distance_m"]) ** 2)

@@ -76,7 +76,7 @@ tags: Final = Table(
 )
 """Zones, arrays and flags of the events, and in a hub their sites and halls: one row for each, of the kind `zone`,
 `array`, `flag`, `site` or `hall`. The other columns repeat those of the event that a search compares. Flags are
-`excluded`, and in a hub `COPY`."""
+`excluded`, and in a hub `COPY`. The time of a `hall` is the end of the event."""
 
 COPY: Final = "copy"
 """Flag of an event that a hub shows only where copies are wanted: another event is shown for its sound."""
