@@ -5,8 +5,9 @@
 A hall of 16 x 12 x 5 m has twelve arrays, one every 4 m, and a border through its middle. Each server gets its own
 six arrays and the three next to the border. Half of the sounds are anywhere, half within a metre of the border. Arrays
 are off their places by the uncertainty that a site file assumes. Each server locates what its arrays record. Counted is
-what it sends to the hub, what the hub takes for one sound, and what one server with all arrays finds. The exit status
-is 1 if a sound that one server with all arrays locates is not shown at all.
+what it sends to the hub, what the hub takes for one sound, and what one server with all arrays finds. Before that, the
+time in which a hub stores events, of a hall and of none, is measured. The exit status is 1 if a sound that one server
+with all arrays locates is not shown at all.
 """
 
 from __future__ import annotations
@@ -14,19 +15,28 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 import yaml
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+
+from hall_events import delivered, hall_event
+from livessl.clock import SystemClock
 from livessl.core.geometry import rotation
 from livessl.core.types import Event, FloatArray, Status
+from livessl.federation.archive import Archive
 from livessl.federation.one_sound import Sighting, sighting, sounds
 from livessl.offline import locate
 from livessl.server.api.encode import JsonObject, Messages
 from livessl.server.forwarding.tile import Tile
+from livessl.server.history.query import Query
 from livessl.simulation.scene import Scene, Source, render
 from livessl.simulation.sounds import SOUNDS
 from livessl.site.load import parse_site
@@ -161,13 +171,41 @@ def counts(outcomes: Sequence[tuple[FloatArray, Shown]]) -> JsonObject:
     }
 
 
+def milliseconds_an_event(count: int, *, in_hall: bool) -> float:
+    """Processor time in which a hub stores events of two servers, one at a time in a hall that is busy all the time.
+
+    Each second has a sound at one of ten places, which both servers send; no two are alike.
+    """
+    with TemporaryDirectory(prefix="livessl-hall-") as folder:
+        archive = Archive(Path(folder) / "hub.sqlite", SystemClock())
+        deliveries = []
+        for number in range(count):
+            site, place = number % 2, (number // 2 * 7) % 10
+            made = hall_event(f"e{number}", (1.0 + place, 2.0 + 0.01 * site, 1.0), at_s=number // 2, in_tile=site == 0)
+            if not in_hall:
+                del made["hall"]
+            deliveries.append(delivered(("west", "east")[site], number // 2 + 1, made))
+        begun_s = time.process_time()
+        for delivery in deliveries:
+            archive.take([delivery], 1.0)
+        spent_s = time.process_time() - begun_s
+        shown = len(archive.store.page(Query(copies=False, limit=count)).rows)
+        archive.close()
+    assert shown == (count // 2 if in_hall else count), "the hub shows other events than those that were made"
+    return 1e3 * spent_s / count
+
+
 def main() -> int:
     """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sounds", type=int, default=200, help="sounds in all (default: 200)")
     parser.add_argument("--rt60", type=float, default=0.7, help="reverberation time, seconds (default: 0.7)")
+    parser.add_argument("--stored", type=int, default=2000, help="events of a hub's processor time (default: 2000)")
     parser.add_argument("--seed", type=int, default=0, help="of places, sounds and noise (default: 0)")
     arguments = parser.parse_args()
+    for in_hall in (False, True):
+        spent_ms = milliseconds_an_event(arguments.stored, in_hall=in_hall)
+        print(f"The hub stores an event of {'a' if in_hall else 'no'} hall in {spent_ms:.2f} ms of a core.")
     rng = np.random.default_rng(arguments.seed)
     whole, servers = hall_site("whole"), [hall_site(name) for name in TILES]
     outcomes: dict[bool, list[tuple[FloatArray, Shown]]] = {True: [], False: []}
