@@ -24,7 +24,7 @@ from livessl.recordings.play import paced_messages
 from livessl.recordings.recording import TimedRecording
 from livessl.service_manager import ServiceManager
 from livessl.site.build.pipeline import make_pipeline
-from livessl.site.keys import node_keys
+from livessl.site.keys import NodeKeys, node_keys
 from livessl.site.models import Site
 from livessl.site.node_models import FurtherServer, NodeConfig
 
@@ -168,7 +168,8 @@ def send_session(
         If no server answers, or the server refuses the sound or has not acknowledged everything.
     """
     pipelines, inputs = make_pipelines(site, recordings, reports_levels=True)
-    link = _link(site, "replay", endpoint, pipelines, clock, run_id, Spool(), is_replay=True)
+    hello = _hello("replay", pipelines, run_id, is_replay=True)
+    link = _link(endpoint, hello, node_keys(site, "replay"), pipelines, clock, Spool())
     link.wait_connected(stop)
     if not (link.connected or link.refused or stop()):
         link.close(bye=False)
@@ -209,10 +210,14 @@ class _Lead:
 def _links(site: Site, name: str, pipelines: Sequence[Pipeline], clock: Clock, run_id: str) -> Links:
     """Return the links to all servers of a node, each with its spool and the arrays that its server gets."""
     config, encode = site.nodes[name], EncodeOnce()
-    links = [_link(site, name, config.server, pipelines, clock, run_id, _spool(site, name, name, encode))]
+    hello, keys = _hello(name, pipelines, run_id), node_keys(site, name)
+    links = [_link(config.server, hello, keys, pipelines, clock, _spool(site, name, name, encode))]
     for further in config.further_servers:
-        spool = _spool(site, name, _folder(name, further), encode)
-        links.append(_link(site, name, further.server, pipelines, clock, run_id, spool, further=further))
+        wanted = set(config.arrays if further.arrays is None else further.arrays)
+        # a joint array is sent for any of its members
+        rates = {each: rate for each, rate in hello.arrays.items() if not wanted.isdisjoint(site.members(each))}
+        keys, spool = node_keys(site, name, further.public_key), _spool(site, name, _folder(name, further), encode)
+        links.append(_link(further.server, replace(hello, arrays=rates), keys, pipelines, clock, spool))
     _warn_of_abandoned_spools(site, name)
     return Links(links)
 
@@ -238,32 +243,27 @@ def _spool(site: Site, name: str, folder: str, encode: Callable[[Frame], bytes])
     directory = None if spool.directory is None else site.file(spool.directory) / folder
     kept = Spool(directory, round(spool.max_mb * 1e6), spool.max_age_s, encode)
     if len(kept):
-        _log.info("the spool %s holds %d frames of an earlier run; they are sent now", folder, len(kept))
+        _log.info("the spool holds %d frames of an earlier run; they are sent now", len(kept))
     return kept
 
 
+def _hello(name: str, pipelines: Sequence[Pipeline], run_id: str, *, is_replay: bool = False) -> wire.Hello:
+    """Return the greeting of a node with all arrays of its pipelines."""
+    rates = {array: pipeline.sample_rate_hz for pipeline in pipelines for array in pipeline.arrays}
+    return wire.Hello(name, run_id, rates, is_replay)
+
+
 def _link(
-    site: Site,
-    name: str,
     endpoint: str,
+    hello: wire.Hello,
+    keys: NodeKeys | None,
     pipelines: Sequence[Pipeline],
     clock: Clock,
-    run_id: str,
     spool: Spool,
-    *,
-    further: FurtherServer | None = None,
-    is_replay: bool = False,
 ) -> Link:
-    rates = {array: pipeline.sample_rate_hz for pipeline in pipelines for array in pipeline.arrays}
-    if further is not None and further.arrays is not None:  # a joint array is sent for any of its members
-        wanted = set(further.arrays)
-        rates = {array: rate for array, rate in rates.items() if not wanted.isdisjoint(site.members(array))}
-
     def backfill(request: BackfillRequest) -> list[Message]:
         return [message for pipeline in pipelines for message in pipeline.backfill(request)]
 
-    hello = wire.Hello(name, run_id, rates, is_replay)
-    keys = node_keys(site, name, None if further is None else further.public_key)
     return Link(endpoint, hello, clock, keys, spool=spool, backfill=backfill)
 
 
