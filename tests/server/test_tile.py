@@ -10,9 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from alert_desk import encoded, sound
+from livessl.core.stream import verdict
 from livessl.core.types import Status
 from livessl.server.api.encode import JsonObject
 from livessl.server.forwarding.tile import MARGIN_M, Tile
+from livessl.server.forwarding.whereabouts import RANGE_UNKNOWN
 from livessl.site.polygon import distance_m
 from small_site import site_of
 
@@ -53,6 +55,17 @@ def test_a_direction_is_sent_if_a_place_along_it_may_be_in_the_tile() -> None:
     assert TILE.sent({**far, "contributions": [{**towards[0], "distance_m": 4.0}]}) is None
     places = [{"position_m": [x, 2.0, 1.0], "probability": 0.5} for x in (9.0, 1.0)]
     assert TILE.sent({**far, "candidates": places}) is not None
+
+
+def test_candidates_at_a_known_distance_are_places() -> None:
+    """A sound beyond the search volume, deep in a neighbour's tile, is not sent: other arrays confirm its distance."""
+    assert RANGE_UNKNOWN == verdict.RANGE_UNKNOWN
+    far = event((9.0, 2.0, 1.0), status=Status.DIRECTION_ONLY)
+    seen = [{"array": name, "azimuth_deg": 0.0, "elevation_deg": 0.0, "distance_m": 8.0} for name in ("north", "south")]
+    places = [{"position_m": [x, 2.0, 1.0], "probability": 0.5} for x in (9.0, 6.0)]
+    assert TILE.sent({**far, "candidates": places, "contributions": seen}) is None
+    assert TILE.sent({**far, "candidates": places, "contributions": seen[:1]}) is not None
+    assert TILE.sent({**far, "candidates": [], "contributions": seen}) is not None
 
 
 @pytest.mark.parametrize(("heard_by", "is_sent"), [(("north",), True), (("south",), False), ((), True)])

@@ -14,6 +14,11 @@ DISTANCE_STD: Final = 0.5
 """Standard deviation of the distance from the nearest array, as a share of it, if an event has a direction only."""
 
 
+RANGE_UNKNOWN: Final = 0.25
+"""Ratio of the position's standard deviation to its distance from the nearest array beyond which the distance is not
+known; that of `livessl.core.stream.verdict`, which a hub does not load."""
+
+
 class Whereabouts(NamedTuple):
     """The places of an event.
 
@@ -24,7 +29,7 @@ class Whereabouts(NamedTuple):
     places_m : ndarray (n, 3)
         The position, or the candidates for it, in metres; none if refused.
     covariance_m2 : ndarray (3, 3)
-        Covariance of each of them; for a direction, the distance counts as known to a factor only.
+        Covariance of each of them. If the distance is not known, it is known to `DISTANCE_STD` here.
     """
 
     status: Status
@@ -47,9 +52,10 @@ def whereabouts(event: JsonObject) -> Whereabouts:
     spread_m2 = _without_negative_variances(covariance_m2)
     if status == Status.LOCATED:
         return Whereabouts(Status.LOCATED, np.array([position_m], dtype=float), spread_m2)
-    candidates = [each["position_m"] for each in event.get("candidates") or ()] or [position_m]
-    places_m = np.array(candidates, dtype=float)
-    return Whereabouts(Status.DIRECTION_ONLY, places_m, spread_m2 + _along_the_sight_m2(event))
+    candidates = [each["position_m"] for each in event.get("candidates") or ()]
+    if not (candidates and _has_distance(event, spread_m2)):
+        spread_m2 = spread_m2 + _along_the_sight_m2(event)
+    return Whereabouts(Status.DIRECTION_ONLY, np.array(candidates or [position_m], dtype=float), spread_m2)
 
 
 def _without_negative_variances(covariance_m2: Any) -> FloatArray:
@@ -57,6 +63,13 @@ def _without_negative_variances(covariance_m2: Any) -> FloatArray:
     given = np.asarray(covariance_m2, dtype=float)
     variances_m2, axes = np.linalg.eigh((given + given.T) / 2.0)
     return np.asarray((axes * np.maximum(variances_m2, 0.0)) @ axes.T)
+
+
+def _has_distance(event: JsonObject, covariance_m2: FloatArray) -> bool:
+    """Return whether an event is a direction for its candidates alone, because its distance is certain enough."""
+    distances_m = [each["distance_m"] for each in event.get("contributions") or ()]
+    spread_m = math.sqrt(max(0.0, float(np.linalg.eigvalsh(covariance_m2)[-1])))
+    return len(distances_m) > 1 and spread_m <= RANGE_UNKNOWN * min(distances_m)
 
 
 def _along_the_sight_m2(event: JsonObject) -> FloatArray:
