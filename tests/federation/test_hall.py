@@ -23,6 +23,8 @@ from livessl.server.api.encode import JsonObject
 from nats_servers import NatsServer, running_nats
 from small_site import HANG_S, running_server, wait_until
 
+pytestmark = pytest.mark.usefixtures("nothing_is_shed")
+
 CLOCK = SystemClock()
 DEEP_WEST, DEEP_EAST = (2.5, 3.5, 1.2), (9.3, 2.2, 1.3)
 AT_BORDER, NEAR_BORDER = (6.1, 3.1, 1.1), (5.6, 1.2, 1.5)
@@ -67,7 +69,8 @@ def events_at(hub: HubServer, query: str = "") -> list[JsonObject]:
 
 def near(events: Sequence[JsonObject], place_m: Sequence[float]) -> list[JsonObject]:
     """The events within half a metre of a place."""
-    return [event for event in events if np.linalg.norm(np.subtract(event["position_m"], place_m)) < 0.5]
+    placed = [event for event in events if event["position_m"] is not None]
+    return [event for event in placed if np.linalg.norm(np.subtract(event["position_m"], place_m)) < 0.5]
 
 
 @pytest.fixture(scope="module")
