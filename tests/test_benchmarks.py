@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import exactness
+import hall
 import help_time
 import peer_maps
 import peers
@@ -45,6 +46,15 @@ def test_kernels_are_timed_beside_bare_look_ups() -> None:
     (ratio,) = (timing.least_ratio for timing in report.timings if timing.least_ratio is not None)
     assert 0.1 < ratio < 100.0
     assert report.kernels in ("numba", "NumPy")
+
+
+@pytest.mark.parametrize("in_hall", [True, False])
+def test_a_hub_shows_each_sound_of_the_benchmarks_hall_once(in_hall: bool) -> None:
+    """The function itself checks how many events are shown."""
+    assert hall.milliseconds_an_event(40, in_hall=in_hall) > 0.0
+    places_m = list(hall.placed(20, np.random.default_rng(0)))
+    assert sum(at_border for at_border, _ in places_m) == 10
+    assert all(abs(place_m[0] - hall.BORDER_M) <= hall.NEAR_M for at_border, place_m in places_m if at_border)
 
 
 @pytest.mark.parametrize("name", peer_maps.PEERS)

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 from livessl import offline
-from livessl.capture.node import UndeliveredError, send_session
+from livessl.capture.links import UndeliveredError
+from livessl.capture.node import send_session
 from livessl.cli.main import main
 from livessl.clock import SystemClock, UnpacedClock
 from livessl.core.types import Block, Event, Float32Array, Frame, Mark

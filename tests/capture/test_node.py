@@ -18,11 +18,11 @@ from livessl import wire
 from livessl.capture.host_clock import HostClock
 from livessl.capture.host_watch import HostWatch
 from livessl.capture.link import Link
+from livessl.capture.links import UndeliveredError
 from livessl.capture.node import (
     AHEAD_NS,
     MAX_PENDING,
     STUCK_NS,
-    UndeliveredError,
     capture_device,
     capture_recordings,
     send_session,

@@ -155,6 +155,18 @@ def test_node_is_enrolled_with_the_printed_keys(site: Path, tmp_path: Path, caps
     assert not list((site.parent / "keys").glob("lab-pc*"))  # the node's secret was never on the server
 
 
+def test_a_further_server_has_a_key_of_its_own(tmp_path: Path) -> None:
+    """A file beside the site file; without it, the key of the node's own server is used."""
+    site = site_of({"keys": "keys"}, tmp_path)
+    own, further = (keys.make_server_keys(tmp_path / folder) for folder in ("west", "east"))
+    keys.make_node_keys(tmp_path / "keys", "lab-pc", own)
+    (tmp_path / "east.public").write_text(f"{further.hex()}\n", encoding="utf-8")
+    held = [keys.node_keys(site, "lab-pc", file) for file in (None, "east.public")]
+    assert [None if each is None else each.server for each in held] == [own, further]
+    with pytest.raises(ConfigError, match=r"north\.public: the server's public key cannot be read"):
+        keys.node_keys(site, "lab-pc", "north.public")
+
+
 def test_secrets_are_in_no_repr(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
     keyed(capsys, "server", "--site", site)
     held = keys.server_keys(load_site(site))

@@ -9,7 +9,7 @@ are not acknowledged.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import replace
 from typing import Final
 
@@ -130,10 +130,19 @@ class Link:
             self._hello_due = True
             self.service()
 
+    @property
+    def arrays(self) -> Collection[str]:
+        """Names of the arrays whose sound the server gets."""
+        return self._hello.arrays
+
+    def queue(self, message: Message) -> None:
+        """Queue a message, which `service` sends."""
+        self._outbox.add(message, self._clock.monotonic_ns(), connected=self._accepted)
+
     def send(self, messages: Iterable[Message]) -> None:
         """Queue messages, and send as many as the connection accepts."""
         for message in messages:
-            self._outbox.add(message, self._clock.monotonic_ns(), connected=self._accepted)
+            self.queue(message)
         self.service()
 
     def service(self) -> None:

@@ -1,8 +1,9 @@
-"""A capture node: one audio device, or recordings played in its place, its arrays, and the link to the server."""
+"""A capture node: one audio device, or recordings played in its place, its arrays, and the links to its servers."""
 
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
@@ -12,27 +13,20 @@ from livessl import wire
 from livessl.capture.device import Device
 from livessl.capture.host_watch import HostWatch
 from livessl.capture.link import Link
+from livessl.capture.links import WAIT_NS, EncodeOnce, Links, UndeliveredError
 from livessl.capture.spool import Spool
 from livessl.clock import Clock
 from livessl.core.stream.pipeline import Pipeline
 from livessl.core.stream.segmenter import RECENT_S
-from livessl.core.types import FRAME_NS, BackfillRequest, Mark, Message
-from livessl.errors import RunError
+from livessl.core.types import FRAME_NS, BackfillRequest, Frame, Mark, Message
 from livessl.recordings.assign import AssignedRecording, make_pipelines
 from livessl.recordings.play import paced_messages
 from livessl.recordings.recording import TimedRecording
 from livessl.service_manager import ServiceManager
 from livessl.site.build.pipeline import make_pipeline
-from livessl.site.keys import node_keys
+from livessl.site.keys import NodeKeys, node_keys
 from livessl.site.models import Site
-from livessl.site.node_models import NodeConfig
-
-DRAIN_NS: Final = 3_000_000_000
-"""Longest wait, in ns, for the last acknowledgement while the server does not answer. While it answers, the wait has no
-limit."""
-
-WAIT_NS: Final = 20_000_000
-"""Interval, in ns, at which a waiting node serves its link."""
+from livessl.site.node_models import FurtherServer, NodeConfig
 
 MAX_PENDING: Final = 400
 """Most unacknowledged messages of a replay that is faster than real time."""
@@ -50,10 +44,6 @@ STUCK_NS: Final = 3_000_000_000
 is silent, or a sound lasts on. It leaves a busy server time to process what it has received."""
 
 _log = logging.getLogger(__name__)
-
-
-class UndeliveredError(RunError):
-    """Sound that the server refused or never acknowledged."""
 
 
 Stop = Callable[[], bool]
@@ -76,7 +66,7 @@ def capture_device(
     """
     config: NodeConfig = site.nodes[name]
     pipeline = make_pipeline(site, config.arrays, device.sample_rate_hz, reports_levels=True)
-    link = _link(site, name, config.server, [pipeline], clock, run_id, _spool(site, name))
+    links = _links(site, name, [pipeline], clock, run_id)
     problem = None
     try:
         with device, HostWatch() as host:
@@ -84,18 +74,18 @@ def capture_device(
                 if stop():
                     break
                 if service is not None:
-                    service.turn(partial(_in_words, link, device.problem))
+                    service.turn(partial(links.in_words, device.problem))
                 if device.problem != problem:
                     problem = device.problem
                     _log.warning("%s", problem or f"device {device.name!r} delivers sound again")
-                    link.report(problem)
-                link.send(
+                    links.report(problem)
+                links.send(
                     with_host(pipeline.push(block), host, device.lost_blocks, sound_server=device.through_sound_server)
                 )
     finally:
         if service is not None:
             service.stopping()
-        link.close(bye=True)
+        links.close(bye=True)
 
 
 def capture_recordings(
@@ -115,18 +105,22 @@ def capture_recordings(
     DeviceError
         If recordings of arrays that the site joins do not belong together.
     UndeliveredError
-        If the server has not acknowledged everything.
+        If a server has not acknowledged everything.
     """
     pipelines, inputs = make_pipelines(site, recordings, reports_levels=True)
-    link = _link(site, name, site.nodes[name].server, pipelines, clock, run_id, _spool(site, name))
+    links = _links(site, name, pipelines, clock, run_id)
+
+    def turn() -> None:
+        if service is not None:
+            service.turn(links.in_words)
+
     try:
         with HostWatch() as host:
-            for end_ns in _sent(link, pipelines, inputs, clock, stop, host):
-                if service is not None:
-                    service.turn(partial(_in_words, link))
+            for end_ns in _sent(links, pipelines, inputs, clock, stop, host):
+                turn()
                 if progress is not None:
                     progress(end_ns)
-        _finish(link, clock, stop, service)
+        links.drain(clock, stop, turn)
     finally:
         if service is not None:
             service.stopping()
@@ -174,7 +168,8 @@ def send_session(
         If no server answers, or the server refuses the sound or has not acknowledged everything.
     """
     pipelines, inputs = make_pipelines(site, recordings, reports_levels=True)
-    link = _link(site, "replay", endpoint, pipelines, clock, run_id, Spool(), replay=True)
+    hello = _hello("replay", pipelines, run_id, is_replay=True)
+    link = _link(endpoint, hello, node_keys(site, "replay"), pipelines, clock, Spool())
     link.wait_connected(stop)
     if not (link.connected or link.refused or stop()):
         link.close(bye=False)
@@ -184,14 +179,14 @@ def send_session(
         )
     lead = _Lead(link, clock)
     end_ns = 0
-    for end_ns in _sent(link, pipelines, inputs, pace, lambda: stop() or link.refused is not None):
+    for end_ns in _sent(Links([link]), pipelines, inputs, pace, lambda: stop() or link.refused is not None):
         if progress is not None:
             progress(end_ns)
         while (link.pending > MAX_PENDING or lead.exceeds(AHEAD_NS, end_ns)) and not (stop() or link.refused):
             _pause(link, clock)
     while lead.exceeds(END_NS, end_ns) and not (stop() or link.refused):  # the server may still request frames
         _pause(link, clock)
-    _finish(link, clock, stop)
+    Links([link]).drain(clock, stop)
 
 
 class _Lead:
@@ -212,37 +207,68 @@ class _Lead:
         return self._clock.monotonic_ns() - self._since_ns < STUCK_NS
 
 
-def _spool(site: Site, name: str) -> Spool:
+def _links(site: Site, name: str, pipelines: Sequence[Pipeline], clock: Clock, run_id: str) -> Links:
+    """Return the links to all servers of a node, each with its spool and the arrays that its server gets."""
+    config, encode = site.nodes[name], EncodeOnce()
+    hello, keys = _hello(name, pipelines, run_id), node_keys(site, name)
+    links = [_link(config.server, hello, keys, pipelines, clock, _spool(site, name, name, encode))]
+    for further in config.further_servers:
+        wanted = set(config.arrays if further.arrays is None else further.arrays)
+        # a joint array is sent for any of its members
+        rates = {each: rate for each, rate in hello.arrays.items() if not wanted.isdisjoint(site.members(each))}
+        keys, spool = node_keys(site, name, further.public_key), _spool(site, name, _folder(name, further), encode)
+        links.append(_link(further.server, replace(hello, arrays=rates), keys, pipelines, clock, spool))
+    _warn_of_abandoned_spools(site, name)
+    return Links(links)
+
+
+def _folder(name: str, further: FurtherServer) -> str:
+    """Return the name of the spool's folder for a further server; no node can have it as its own name."""
+    return f"{name}@{re.sub('[^A-Za-z0-9.-]+', '_', further.server.removeprefix('tcp://'))}"
+
+
+def _warn_of_abandoned_spools(site: Site, name: str) -> None:
+    """Log the folders whose server the site file no longer names: their sound is never sent, and stays there."""
+    config = site.nodes[name]
+    if config.spool.directory is None:
+        return
+    wanted = {_folder(name, further) for further in config.further_servers}
+    for folder in site.file(config.spool.directory).glob(f"{name}@*"):
+        if folder.name not in wanted:
+            _log.warning("no server of nodes.%s.further_servers gets the frames in %s; delete the folder", name, folder)
+
+
+def _spool(site: Site, name: str, folder: str, encode: Callable[[Frame], bytes]) -> Spool:
     spool = site.nodes[name].spool
-    directory = None if spool.directory is None else site.file(spool.directory) / name
-    kept = Spool(directory, round(spool.max_mb * 1e6), spool.max_age_s)
+    directory = None if spool.directory is None else site.file(spool.directory) / folder
+    kept = Spool(directory, round(spool.max_mb * 1e6), spool.max_age_s, encode)
     if len(kept):
         _log.info("the spool holds %d frames of an earlier run; they are sent now", len(kept))
     return kept
 
 
+def _hello(name: str, pipelines: Sequence[Pipeline], run_id: str, *, is_replay: bool = False) -> wire.Hello:
+    """Return the greeting of a node with all arrays of its pipelines."""
+    rates = {array: pipeline.sample_rate_hz for pipeline in pipelines for array in pipeline.arrays}
+    return wire.Hello(name, run_id, rates, is_replay)
+
+
 def _link(
-    site: Site,
-    name: str,
     endpoint: str,
+    hello: wire.Hello,
+    keys: NodeKeys | None,
     pipelines: Sequence[Pipeline],
     clock: Clock,
-    run_id: str,
     spool: Spool,
-    *,
-    replay: bool = False,
 ) -> Link:
-    rates = {array: pipeline.sample_rate_hz for pipeline in pipelines for array in pipeline.arrays}
-
     def backfill(request: BackfillRequest) -> list[Message]:
         return [message for pipeline in pipelines for message in pipeline.backfill(request)]
 
-    hello = wire.Hello(name, run_id, rates, replay)
-    return Link(endpoint, hello, clock, node_keys(site, name), spool=spool, backfill=backfill)
+    return Link(endpoint, hello, clock, keys, spool=spool, backfill=backfill)
 
 
 def _sent(
-    link: Link,
+    links: Links,
     pipelines: Sequence[Pipeline],
     inputs: Sequence[TimedRecording],
     pace: Clock,
@@ -253,38 +279,8 @@ def _sent(
     for end_ns, batch in paced_messages(pipelines, inputs, pace):
         if stop():
             return
-        link.send(batch if host is None else with_host(batch, host))
+        links.send(batch if host is None else with_host(batch, host))
         yield end_ns
-
-
-def _finish(link: Link, clock: Clock, stop: Stop, service: ServiceManager | None = None) -> None:
-    """Wait for the last acknowledgement, which may be long in coming, then close the link with a good-bye."""
-    answered_ns = clock.monotonic_ns()
-    while link.pending and not (stop() or link.refused) and clock.monotonic_ns() - answered_ns < DRAIN_NS:
-        if link.connected:
-            answered_ns = clock.monotonic_ns()
-        if service is not None:
-            service.turn(partial(_in_words, link))
-        _pause(link, clock)
-    undelivered, refused = link.pending + link.dropped, link.refused
-    link.close(bye=True)
-    if refused and not stop():
-        raise UndeliveredError(f"the server at {link.endpoint} refused the sound: {refused}")
-    if undelivered and not stop():
-        raise UndeliveredError(
-            f"{undelivered} messages were never acknowledged by the server at {link.endpoint}; is one running there?"
-        )
-
-
-def _in_words(link: Link, problem: str | None = None) -> str:
-    """Return the state of a node: the problem of its device if there is one, and whether the server takes its sound."""
-    if link.refused is not None:
-        server = f"the server at {link.endpoint} refuses this node: {link.refused}"
-    elif link.connected:
-        server = f"connected to the server at {link.endpoint}"
-    else:
-        server = f"no answer of the server at {link.endpoint}; {link.kept} frames wait for it"
-    return server if problem is None else f"{problem}; {server}"
 
 
 def _pause(link: Link, clock: Clock) -> None:

@@ -15,6 +15,7 @@ import os
 import struct
 import zlib
 from collections import Counter, deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -67,6 +68,8 @@ class Spool:
         Largest number of bytes of all messages together.
     max_age_s : float
         Frames that are older than the newest by more than this are removed.
+    encode : callable
+        Returns a frame as it goes over the wire.
 
     Raises
     ------
@@ -75,9 +78,14 @@ class Spool:
     """
 
     def __init__(
-        self, directory: Path | None = None, max_bytes: int = MEMORY_BYTES, max_age_s: float = float("inf")
+        self,
+        directory: Path | None = None,
+        max_bytes: int = MEMORY_BYTES,
+        max_age_s: float = float("inf"),
+        encode: Callable[[Frame], bytes] = wire.encode,
     ) -> None:
         self._directory = directory
+        self._encode = encode
         self._max_bytes = max_bytes
         self._max_age_frames = max_age_s * 1e9 / FRAME_NS
         self._kept: dict[str, deque[Kept]] = {}
@@ -110,7 +118,7 @@ class Spool:
         Kept frames of this array with the same or a later time are removed: then the clock was set back.
         """
         removed = self._clear_from(frame)
-        data = wire.encode(frame)
+        data = self._encode(frame)
         kept = self._on_disk(frame, data) or Kept(frame.array, frame.frame_index, len(data), data)
         self._add(kept)
         while self._has_too_much(frame.frame_index):

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from livessl.cli import argument
 from livessl.cli.exits import OK, WRONG_USE
@@ -13,6 +14,9 @@ from livessl.cli.options import add_json
 from livessl.cli.output import print_warnings
 from livessl.cli.own_work import NO_PICTURE, is_own_picture, refuse_foreign
 from livessl.errors import ConfigError, Fault
+
+if TYPE_CHECKING:
+    from livessl.site.models import Site
 
 
 def add_arguments(parser: Any) -> None:
@@ -57,11 +61,37 @@ def run(arguments: argparse.Namespace) -> int:
         figure.draw(site, arguments.png)
     if arguments.json:
         checked = {"valid": True, "faults": [], "warnings": list(site.warnings), "site": site.site}
-        summary = {**checked, "arrays": list(site.arrays), "nodes": grid.size}
+        summary = {**checked, "arrays": list(site.arrays), "nodes": grid.size, **_tile_as_json(site)}
         print(json.dumps({**summary, "layout": terminal.as_json(layout, arguments.rt60)}))
     else:
         print_warnings(site)
         arrays = ", ".join(f"{spec.name} ({len(spec.microphones_m)} microphones)" for spec in site.processed)
         print(f"{arguments.site}: valid; site {site.site!r}, arrays {arrays}, {grid.size:,} grid points")
+        for line in _tile_in_words(site):
+            print(line)
         print(terminal.as_text(layout, arguments.rt60))
     return OK
+
+
+def _tile_as_json(site: Site) -> dict[str, Any]:
+    """Return the hall and whose the arrays are; nothing for a site that has its room to itself."""
+    from livessl.site.hall import hall_of, neighbourhood
+
+    hall = hall_of(site)
+    return {} if hall is None else {"hall": {"name": hall.name, **neighbourhood(site, hall)._asdict()}}
+
+
+def _tile_in_words(site: Site) -> Iterator[str]:
+    """Yield what the tile of a hall means for a person; nothing for a site that has its room to itself."""
+    from livessl.site.hall import hall_of, neighbourhood
+    from livessl.site.polygon import signed_area_m2
+
+    hall = hall_of(site)
+    if hall is None:
+        return
+    own, neighbours = neighbourhood(site, hall)
+    yield (
+        f"hall {hall.name!r}: this server's tile has {abs(signed_area_m2(hall.tile_m)):g} m2, with the arrays "
+        f"{', '.join(own) or 'none'}; its neighbours' arrays: {', '.join(neighbours) or 'none'}"
+    )
+    yield "the hub gets its events in and near the tile, and shows a sound that a neighbour locates as well once"

@@ -76,6 +76,7 @@ def describe(contact: Contact, states: Mapping[str, str]) -> JsonObject:
         "age_s": round(contact.age_s, 3),
         "version": contact.report.get("version"),
         "location_deg": contact.report.get("location_deg"),
+        "hall": contact.report.get("hall"),
         "arrays": states,
         "waiting": contact.waiting,
         "missing": contact.missing,

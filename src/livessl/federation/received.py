@@ -23,6 +23,7 @@ def _instant(text: str) -> str:
 Instant = Annotated[str, AfterValidator(_instant)]
 Name = Annotated[str, Field(min_length=1, max_length=200)]
 Coordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
+Row = Annotated[list[Annotated[float, Field(ge=-1e12, le=1e12)]], Field(min_length=3, max_length=3)]
 
 
 class _Message(BaseModel):
@@ -33,6 +34,13 @@ class _Message(BaseModel):
 
 class _Start(_Message):
     """The beginning of a site's server."""
+
+
+class _Hall(_Message):
+    """The hall of an event, and whether it lies in the tile of its site."""
+
+    name: Name
+    in_tile: bool
 
 
 class _Event(_Message):
@@ -49,6 +57,9 @@ class _Event(_Message):
     zones: list[Name] = []
     arrays: list[Name] = []
     heard_by: list[Name] = []
+    duration_s: Annotated[float, Field(ge=0, le=1e6)] = 0.0
+    covariance_m2: Annotated[list[Row], Field(min_length=3, max_length=3)] | None = None
+    hall: _Hall | None = None
 
 
 class _Track(_Message):
@@ -72,12 +83,20 @@ class _Alert(_Message):
     raised_utc: Instant
 
 
+class _Tile(_Message):
+    """The hall of a site, and its tile there."""
+
+    name: Name
+    tile_m: list[tuple[Coordinate, Coordinate]]
+
+
 class Report(_Message):
     """A site's report on itself."""
 
     version: str | None = None
     waiting: int = 0
     location_deg: tuple[float, float] | None = None
+    hall: _Tile | None = None
     arrays: dict[str, str] = {}
 
 

@@ -133,6 +133,10 @@ def _filters(chosen: Any) -> Callable[..., EventQuery]:
             str | None,
             Query(description="only events that an array of this name detected or contributed to, at any site"),
         ] = None,
+        copies: Annotated[
+            bool,
+            Query(description="also events for whose sound the event of a neighbouring server in the hall is shown"),
+        ] = False,
     ) -> EventQuery:
         require_no_nul(zone=zone, array=array)
         return EventQuery(
@@ -143,6 +147,7 @@ def _filters(chosen: Any) -> Callable[..., EventQuery]:
             status=None if status is None else str(status),
             min_confidence=min_confidence,
             array=array,
+            copies=copies,
         )
 
     return filters

@@ -34,6 +34,16 @@ class HubCondition(StrEnum):
     DEGRADED = "degraded"
 
 
+class Tile(BaseModel):
+    """The hall that a site shares with others, and its part of it."""
+
+    name: str = Field(description="Name of the hall.", examples=["works"])
+    tile_m: list[list[float]] = Field(
+        description="Corners [x, y] of the site's tile on the floor plan of the hall, in metres.",
+        examples=[[[0.0, 0.0], [30.0, 0.0], [30.0, 30.0], [0.0, 30.0]]],
+    )
+
+
 class SiteState(BaseModel):
     """A site, as the hub knows it."""
 
@@ -45,6 +55,7 @@ class SiteState(BaseModel):
     location_deg: list[float] | None = Field(
         description="Latitude and longitude in degrees, where its site file has them.", examples=[[52.52, 13.40]]
     )
+    hall: Tile | None = Field(description="Hall and tile of the site; null if it has its room to itself.")
     arrays: dict[str, ArrayCondition] = Field(description="State of each array by name.")
     waiting: int = Field(ge=0, description="Messages that waited at the site at its last report.", examples=[0])
     missing: int = Field(ge=0, description="Messages that never came: the site or NATS had deleted them.", examples=[0])
@@ -57,10 +68,35 @@ class Sites(Versioned):
     sites: list[SiteState]
 
 
+class EventName(BaseModel):
+    """The name of an event at the hub."""
+
+    site: SiteName
+    id: str = Field(description="Its id at the site.", examples=["lab-1767225600000-1"])
+
+
+class EventHall(BaseModel):
+    """The hall of an event."""
+
+    name: str = Field(description="Name of the hall.", examples=["works"])
+    in_tile: bool = Field(description="Whether its position lies in the tile of its site.", examples=[True])
+
+
 class SiteEvent(Event):
     """A final event of a site."""
 
     site: SiteName
+    hall: EventHall | None = Field(default=None, description="Hall of the site; null if it has its room to itself.")
+    copy_of: EventName | None = Field(
+        default=None,
+        description="Event of a neighbouring server that is shown for this sound instead; null for an event that is "
+        "shown itself.",
+    )
+    copies: list[EventName] = Field(
+        default=[],
+        description="Events of neighbouring servers that are the same sound, and are not shown.",
+        examples=[[]],
+    )
 
 
 class SiteEventPage(Versioned):

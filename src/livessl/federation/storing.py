@@ -10,6 +10,7 @@ import orjson
 from sqlalchemy import Connection, Table, bindparam, delete, insert, select
 
 from livessl.clock import utc_ns
+from livessl.federation.copies import as_stored, hall_tags, lock_halls, mark_copies
 from livessl.federation.received import RECEIVED
 from livessl.server.api.encode import JsonObject
 from livessl.server.forwarding.stream import Place
@@ -133,7 +134,9 @@ def _put_events(connection: Connection, messages: Sequence[JsonObject]) -> None:
     rows: dict[str, dict[str, Any]] = {}
     known_as: dict[str, JsonObject] = {}
     for message in messages:
-        known_as.setdefault(f"{message['site']}/{message['id']}", message)
+        known_as.setdefault(f"{message['site']}/{message['id']}", as_stored(message))
+    if any(message.get("hall") for message in messages):
+        lock_halls(connection)
     for key, message in known_as.items():
         rows[key] = {**history.event_row(message, utc_ns(message["time_utc"])), "id": key}
     query = select(history.events.c.id).where(history.events.c.id.in_(list(rows)))
@@ -150,7 +153,9 @@ def _put_events(connection: Connection, messages: Sequence[JsonObject]) -> None:
         tags += history.tag_rows(message, row, number)
         compared = {name: row[name] for name in ("time_ns", "confidence", "status", "level_dbfs")}
         tags.append({"kind": "site", "name": message["site"], "number": number, **compared})
+        tags += hall_tags(message, {"number": number, **compared})
     connection.execute(insert(history.tags), tags)
+    mark_copies(connection, [known_as[key] for key in rows])
 
 
 def _put_alerts(connection: Connection, messages: Sequence[JsonObject]) -> None:

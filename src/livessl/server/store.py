@@ -16,6 +16,7 @@ from sqlalchemy import select
 
 from livessl.server.forwarding import tables as forwarding
 from livessl.server.forwarding.outbox import Outbox
+from livessl.server.forwarding.tile import Tile
 from livessl.server.history import records
 from livessl.server.history.backlog import Backlog
 from livessl.server.history.database import CURE, Database, StoreError
@@ -63,6 +64,8 @@ class Store:
         The SQLite file, or the URL of a PostgreSQL database; None keeps the newest `MAX_EVENTS_IN_MEMORY` in memory.
     forwards : bool
         Whether it has the tables of `livessl.server.forwarding`, and puts final events into the outbox of a hub.
+    tile : Tile or None
+        Chooses the events for the hub in a hall of several servers; None if all are sent.
 
     Raises
     ------
@@ -72,12 +75,12 @@ class Store:
         If the driver of PostgreSQL is not installed.
     """
 
-    def __init__(self, place: Path | str | None = None, *, forwards: bool = False) -> None:
+    def __init__(self, place: Path | str | None = None, *, forwards: bool = False, tile: Tile | None = None) -> None:
         self._bounded = place is None
         self._count = EventCount()
         self._when_ready: deque[Callable[[], None]] = deque()
         self._database = Database(place, (forwarding.prepare,) if forwards else ())
-        self.outbox = Outbox(self._database) if forwards else None
+        self.outbox = Outbox(self._database, tile) if forwards else None
         """Messages for the hub; None for a site without one."""
         self.backlog = Backlog(self.prepare)
         """Events that wait to be stored."""
@@ -93,7 +96,7 @@ class Store:
     @classmethod
     def of(cls, site: Site) -> Store:
         """Return the store that a site file names."""
-        return cls(history_place(site), forwards=site.server.hub is not None)
+        return cls(history_place(site), forwards=site.server.hub is not None, tile=Tile.of(site))
 
     @property
     def database(self) -> Database:

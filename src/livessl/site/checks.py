@@ -24,6 +24,7 @@ from livessl.site.calibration_file import is_absent
 from livessl.site.fields import Bounds
 from livessl.site.findings import unknown_array
 from livessl.site.guesses import box_cure, position_cure, rate_cure, unlikely
+from livessl.site.hall import hall_faults, hall_warnings
 from livessl.site.models import Site
 from livessl.site.node_models import NodeConfig
 from livessl.site.place import Finding, Place
@@ -79,6 +80,7 @@ def cross_faults(site: Site) -> Iterator[Finding]:
         here: Place = ("arrays", other.name) if joint is None else ("joint", joint)
         yield from ((here, what) for what in _coincident(one, other))
     yield from _node_faults(site)
+    yield from hall_faults(site)
     yield from alert_faults(site)
     yield from _server_faults(site)
 
@@ -101,6 +103,7 @@ def warnings_of(site: Site) -> tuple[str, ...]:
         *_look_alikes(site),
         *_privacy_gaps(site),
         *alert_warnings(site),
+        *hall_warnings(site),
     )
 
 

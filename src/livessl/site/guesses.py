@@ -225,7 +225,8 @@ def _nodes(site: Site) -> Iterator[str]:
         if name not in captured:
             yield f"arrays.{name}: no node captures it; add its channels to the arrays of a node, or remove it"
     for name, node in site.nodes.items():
-        yield from (f"nodes.{name}.server: {what}" for what in _addresses(node.server, site.server.bind, site))
+        if all(any(_addresses(endpoint, site.server.bind, site)) for endpoint in node.endpoints):
+            yield from (f"nodes.{name}.server: {what}" for what in _addresses(node.server, site.server.bind, site))
         yield from (f"nodes.{name}.arrays.{what}" for what in _inputs(node))
 
 

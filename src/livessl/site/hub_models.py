@@ -5,10 +5,11 @@ from __future__ import annotations
 from typing import Annotated, Final
 from urllib.parse import urlsplit
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field, field_validator, model_validator
 
+from livessl.site import polygon
 from livessl.site.addresses import is_loopback
-from livessl.site.fields import FileName, Model
+from livessl.site.fields import Coordinate, FileName, Model
 
 FORM: Final = "expected tls://HOST:PORT, or nats://HOST:PORT on this machine"
 
@@ -57,7 +58,30 @@ class NatsConfig(Model):
         return self
 
 
+class HallConfig(Model):
+    """The hall that several servers share, and the part of its floor plan, in metres, that belongs to this server.
+
+    All servers of a hall use the coordinates of the hall.
+    """
+
+    name: Annotated[str, Field(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9._-]+$")]
+    tile_m: tuple[tuple[Coordinate, Coordinate], ...]
+
+    @field_validator("tile_m")
+    @classmethod
+    def _simple(cls, points: tuple[polygon.Point, ...]) -> tuple[polygon.Point, ...]:
+        if len(points) > 3 and points[0] == points[-1]:
+            points = points[:-1]  # a closed ring, as other programs write it
+        faults = polygon.polygon_faults(points)
+        if faults:
+            raise ValueError(
+                f"expected a polygon with {'; '.join(faults)}; give the corners [x, y] of the tile in order around it"
+            )
+        return points
+
+
 class HubLinkConfig(NatsConfig):
-    """The connection of a site's server to a hub, and where on Earth the site is."""
+    """The connection of a site's server to a hub, where on Earth the site is, and its part of a hall."""
 
     location_deg: tuple[Annotated[float, Field(ge=-90, le=90)], Annotated[float, Field(ge=-180, le=180)]] | None = None
+    hall: HallConfig | None = None

@@ -117,8 +117,16 @@ def server_keys(site: Site) -> ServerKeys | None:
     return ServerKeys(_read_pair(directory, SERVER, "`livessl keys server`"), enrolled(directory))
 
 
-def node_keys(site: Site, name: str) -> NodeKeys | None:
+def node_keys(site: Site, name: str, server: str | None = None) -> NodeKeys | None:
     """Return a node's keys; None if the site uses no keys.
+
+    Parameters
+    ----------
+    site : Site
+    name : str
+        Name of the node.
+    server : str or None
+        File with the public key of a further server; None for the key of the node's own server.
 
     Raises
     ------
@@ -129,7 +137,7 @@ def node_keys(site: Site, name: str) -> NodeKeys | None:
         return None
     directory = site.file(site.keys)
     own = _read_pair(directory, name, f"`livessl keys node {name}`")
-    return NodeKeys(own, _read_public(directory / f"{SERVER}.public"))
+    return NodeKeys(own, _read_public(directory / f"{SERVER}.public" if server is None else site.file(server)))
 
 
 def enrolled(directory: Path) -> dict[str, bytes]:

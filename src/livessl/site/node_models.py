@@ -62,10 +62,28 @@ class SpoolConfig(Model):
     max_age_s: Positive = 3600.0
 
 
+class FurtherServer(Model):
+    """A further server that a node sends to: the neighbour in a hall that is divided among servers.
+
+    `arrays` are the arrays whose sound it gets; None for all arrays of the node. `public_key` is the file with the
+    server's public key; None if it has the key of the node's first server.
+    """
+
+    server: str
+    arrays: Annotated[tuple[str, ...], Field(min_length=1)] | None = None
+    public_key: FileName | None = None
+
+    @field_validator("server")
+    @classmethod
+    def _endpoint(cls, endpoint: str) -> str:
+        return check_endpoint(endpoint)
+
+
 class NodeConfig(Model):
     """A capture node: one device, and one or more arrays on its channels, which are counted from 1."""
 
     server: str = "tcp://127.0.0.1:5570"
+    further_servers: tuple[FurtherServer, ...] = ()
     device: DeviceConfig
     spool: SpoolConfig = SpoolConfig()
     arrays: Annotated[dict[str, list[int]], Field(min_length=1)]
@@ -105,3 +123,8 @@ class NodeConfig(Model):
     @classmethod
     def _endpoint(cls, endpoint: str) -> str:
         return check_endpoint(endpoint)
+
+    @property
+    def endpoints(self) -> tuple[str, ...]:
+        """Addresses of all servers that the node sends to."""
+        return self.server, *(further.server for further in self.further_servers)

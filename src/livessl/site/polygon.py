@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from itertools import combinations
 from typing import Final
@@ -56,6 +57,22 @@ def contains(points: Sequence[Point], x: float, y: float) -> bool:
         if (y0 > y) != (y1 > y) and x < x0 + (y - y0) / (y1 - y0) * (x1 - x0):
             inside = not inside
     return inside
+
+
+def distance_m(points: Sequence[Point], x: float, y: float) -> float:
+    """Return how far a point lies outside a polygon, in metres; 0 for a point that the polygon holds."""
+    if contains(points, x, y):
+        return 0.0
+    return min(_distance_to_edge_m(one, other, (x, y)) for one, other in _edges(points))
+
+
+def _distance_to_edge_m(one: Point, other: Point, point: Point) -> float:
+    """Return the distance, in metres, of a point from the line segment between two others."""
+    length_m = math.dist(one, other)
+    along = 0.0 if length_m == 0.0 else _dot(one, other, point) / length_m**2
+    share = min(1.0, max(0.0, along))
+    nearest = one[0] + share * (other[0] - one[0]), one[1] + share * (other[1] - one[1])
+    return math.dist(nearest, point)
 
 
 def _edges(points: Sequence[Point]) -> Iterator[tuple[Point, Point]]:

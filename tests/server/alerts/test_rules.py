@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 from alert_desk import ELSEWHERE, alert_site, encoded, refused, sound
 from livessl.core.types import Event, Status
 from livessl.server.alerts.rules import RuleState, Verdict, judge_event, match
+from livessl.server.forwarding.tile import Tile
 from livessl.server.zones.zone_map import ZoneMap
-from livessl.site.alert_models import AlertRule
+from livessl.site.alert_models import AlertRule, EventCondition
 
 ZONES = ZoneMap(alert_site())
 EAGER = {"hold_off_s": 0}
@@ -191,3 +192,15 @@ def test_events_in_any_order_within_the_span_alert_once() -> None:
     events = [sound(number) for number in range(3)]
     random.Random(4).shuffle(events)
     assert verdicts(counting, *events) == ["counting", "counting", "alert"]
+
+
+def test_a_rule_without_zones_leaves_sounds_in_a_neighbours_tile_to_the_neighbour() -> None:
+    """Both servers of a hall locate them; a rule that names zones means them wherever they are."""
+    tile = Tile("works", ((0.0, 0.0), (4.0, 0.0), (4.0, 1.0), (0.0, 1.0)), frozenset(("north",)))
+    here, there = (encoded(sound(position_m=(0.5, y_m, 1.0))) for y_m in (0.5, 4.0))
+    anything = EventCondition()
+    assert [match(anything, event, ZONES, tile) is not None for event in (here, there)] == [True, False]
+    assert match(anything, there, ZONES) is not None
+    door = EventCondition(zones=("door",))
+    far = Tile("works", ((3.0, 4.0), (4.0, 4.0), (4.0, 5.0)), frozenset(("north",)))
+    assert match(door, here, ZONES, far) is not None

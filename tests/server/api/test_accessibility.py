@@ -327,10 +327,16 @@ def test_page_of_a_hub(browser: Browser, tmp_path: Path) -> None:
         | {"newest_event_utc": utc_text(START_NS), "location_deg": [52.5, 13.4]}
         for name, status in zip(("lab", "yard", "hall", "a-site-with-a-long-name-in-the-north"), states, strict=True)
     ]
+    copy = {"site": "hall", "id": "hall-1"}
     with running_hub(make_hub("hub.sqlite", ["nats://127.0.0.1:9"], tmp_path)) as hub, faultless_page(browser) as page:
         answer_with(page, "sites", sites=sites)
-        answer_with(page, "events?*", events=[event_message(site="lab"), event_message(site="yard", id="small-2")])
+        answer_with(
+            page,
+            "events?*",
+            events=[event_message(site="lab", copies=[copy]), event_message(site="yard", id="small-2")],
+        )
         opened(page, hub.url)
         expect(page.get_by_test_id("sites").get_by_role("row")).to_have_count(4, timeout=MS)
         expect(page.get_by_test_id("events").get_by_role("row")).to_have_count(2, timeout=MS)
+        expect(page.get_by_test_id("events").get_by_text("lab, also hall")).to_be_visible(timeout=MS)
         assert violations(page, "hub") == []

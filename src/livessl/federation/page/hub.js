@@ -58,12 +58,12 @@ function point({ site, status, location_deg: [latitude, longitude] }) {
 }
 
 function showEvents(events) {
-  const text = JSON.stringify(events.map(({ site, id }) => [site, id]));
+  const text = JSON.stringify(events.map(({ site, id, copies }) => [site, id, copies]));
   if (text === shown) return;
   shown = text;
   find("events").replaceChildren(...events.map((event) => el("tr", { "data-id": event.id },
     el("td", { text: when(event, Date.now()) }),
-    el("td", { text: event.site }),
+    el("td", { text: [event.site, ...(event.copies ?? []).map((copy) => `also ${copy.site}`)].join(", ") }),
     el("td", { text: event.position_m ? position(event.position_m) : "–" }),
     el("td", { text: percent(event.confidence) }),
     el("td", { text: event.status.replace("-", " "), title: event.reason ?? undefined }))));

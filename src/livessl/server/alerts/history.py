@@ -6,14 +6,18 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Final
 
 from livessl.clock import utc_ns
-from livessl.server.alerts.rules import SUPPRESSED, RuleState, Verdict, judge_event, match
+from livessl.server.alerts.rules import SUPPRESSED, Match, RuleState, Verdict, judge_event, match
 from livessl.server.api.encode import JsonObject
+from livessl.server.forwarding.tile import Tile
 from livessl.server.store import Query, Store
 from livessl.server.zones.zone_map import ZoneMap
-from livessl.site.alert_models import AlertRule, AlertsConfig
+from livessl.site.alert_models import AlertRule, AlertsConfig, EventCondition
+
+Meets = Callable[[EventCondition, JsonObject], Match | None]
 
 PAGE: Final = 500
 """Number of events that are read from the store at one time, so that other threads do not wait long for the store."""
@@ -79,9 +83,14 @@ class DryRuns:
     store : Store
     zones : callable
         Returns the zones that are in force.
+    tile : Tile or None
+        The tile of the site in a hall of several servers; None for a site that has its room to itself.
     """
 
-    def __init__(self, config: AlertsConfig, store: Store, zones: Callable[[], ZoneMap]) -> None:
+    def __init__(
+        self, config: AlertsConfig, store: Store, zones: Callable[[], ZoneMap], tile: Tile | None = None
+    ) -> None:
+        self._tile = tile
         self._config = config
         self._store = store
         self._zones = zones
@@ -98,16 +107,18 @@ class DryRuns:
         if not self._trying.acquire(blocking=False):
             raise DryRunBusyError
         try:
-            rules, zone = self._config.rules, self._config.timezone
-            return try_rule(rules[rule], self._store, self._zones(), zone, since_ns, before_ns)
+            meets = partial(match, zones=self._zones(), tile=self._tile)
+            return try_rule(self._config.rules[rule], self._store, meets, self._config.timezone, since_ns, before_ns)
         finally:
             self._trying.release()
 
 
 def try_rule(
-    rule: AlertRule, store: Store, zones: ZoneMap, timezone: str | None, since_ns: int, before_ns: int
+    rule: AlertRule, store: Store, meets: Meets, timezone: str | None, since_ns: int, before_ns: int
 ) -> DryRun:
     """Return the alerts that a rule on events would have raised in a span of site time, if it was always armed.
+
+    `meets` returns how an event meets a condition, or None.
 
     For each matching event, only the data for the verdict is kept, because the span may have many events.
     """
@@ -118,7 +129,7 @@ def try_rule(
     while query is not None and tried < MAX_TRIED:
         page, query = _page(store, query)
         tried += len(page)
-        matches += [(_gist(event), at) for event, at in page if match(condition, event, zones) is not None]
+        matches += [(_gist(event), at) for event, at in page if meets(condition, event) is not None]
     state, alerts, latest = RuleState(), 0, deque[JsonObject](maxlen=EXAMPLES)
     for event, time_ns in reversed(matches):
         verdict, state = judge_event(rule, state, event, time_ns, timezone)

@@ -17,6 +17,7 @@ from livessl.server.alerts.message import AlertMessages, with_links
 from livessl.server.alerts.outbox import Outbox
 from livessl.server.alerts.rule_runner import RuleRunner
 from livessl.server.event_traces import EventTraces
+from livessl.server.forwarding.tile import Tile
 from livessl.server.signed_links import SignedLinks
 from livessl.server.store import Store
 from livessl.server.zones.zone_map import ZoneMap
@@ -86,7 +87,7 @@ class AlertsInForce:
         base = self.config.url or around.url + site.server.http.root_path
         self.deliverers = {name: _deliverer(name, site, around, outbox, base) for name in self.config.actions}
         """The deliverer of each action, by name."""
-        self.dry_runs = DryRuns(self.config, around.store, around.zones)
+        self.dry_runs = DryRuns(self.config, around.store, around.zones, Tile.of(site))
         """Tries rules on the history."""
         self.runner = RuleRunner(site, around.clock, outbox, AlertMessages(site, base), around.zones)
         """The rules with their states."""

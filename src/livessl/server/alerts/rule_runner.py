@@ -18,6 +18,7 @@ from livessl.server.alerts.message import AlertMessages
 from livessl.server.alerts.outbox import Outbox, Raised
 from livessl.server.alerts.rules import RuleState, Verdict, judge_and_note, judge_event, match
 from livessl.server.api.encode import JsonObject
+from livessl.server.forwarding.tile import Tile
 from livessl.server.set_up_watch import SetUpState
 from livessl.server.zones.zone_map import ZoneMap
 from livessl.site.models import Site
@@ -72,6 +73,7 @@ class RuleRunner:
         self._outbox = outbox
         self._messages = messages
         self._zones = zones
+        self._tile = Tile.of(site)
         self._lock = threading.Lock()
         self._watches = {
             name: ConditionWatch(rule, self._zone)
@@ -129,7 +131,7 @@ class RuleRunner:
             for name, rule in self._rules.items():
                 if rule.events is None or (early and not rule.events.early):
                     continue
-                found = match(rule.events, event, zones)
+                found = match(rule.events, event, zones, self._tile)
                 if found is not None:
                     # any of these keys says that this sound has alerted, as an early event or before a restart
                     keys = [self._messages.key(name, each) for each in (event["id"], *event["replaces"])]

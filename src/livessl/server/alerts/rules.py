@@ -13,6 +13,7 @@ from typing import Any, Final, Self
 
 from livessl.server.alerts.schedule import is_open
 from livessl.server.api.encode import JsonObject
+from livessl.server.forwarding.tile import Tile
 from livessl.server.zones.zone_map import ZoneMap
 from livessl.site.alert_models import AlertRule, EventCondition
 
@@ -133,8 +134,11 @@ class Match:
         return max(self.zones.values(), default=None)
 
 
-def match(condition: EventCondition, event: JsonObject, zones: ZoneMap) -> Match | None:
-    """Return how an event meets a condition, None if it does not; a refused or an excluded event meets none."""
+def match(condition: EventCondition, event: JsonObject, zones: ZoneMap, tile: Tile | None = None) -> Match | None:
+    """Return how an event meets a condition, None if it does not; a refused or an excluded event meets none.
+
+    In a hall of several servers, an event that only concerns their tiles meets no condition without zones.
+    """
     if event["status"] not in condition.statuses or event["position_m"] is None:
         return None
     if event["confidence"] < condition.min_confidence or event["duration_s"] < condition.min_duration_s:
@@ -146,6 +150,8 @@ def match(condition: EventCondition, event: JsonObject, zones: ZoneMap) -> Match
     # a rule can be older than a zone: one that was deleted holds nothing
     inside = {zone: found[zone] for zone in condition.zones if found.get(zone, 0.0) >= condition.probability}
     if (condition.zones and not inside) or _is_excluded(event, zones, found):
+        return None
+    if tile is not None and not condition.zones and not tile.concerns(event):
         return None
     return Match(inside)
 

@@ -99,6 +99,7 @@ class HubLink:
         self._options = connect_options(config, site.file, PLACE) | {"name": f"livessl {site.site}"}
         self._site = site.site
         self._location_deg = config.location_deg
+        self._hall = None if config.hall is None else config.hall.model_dump(mode="json")
         self._clock = clock
         self._outbox = outbox
         self.messages = HubMessages(clock, outbox, backlog)
@@ -280,6 +281,7 @@ class HubLink:
             "now_utc": utc_text(self._clock.now_ns()),
             "waiting": self.waiting,
             "location_deg": self._location_deg,
+            "hall": self._hall,
             "arrays": {array["name"]: array["state"] for array in self._arrays()},
         }
 

@@ -13,6 +13,7 @@ from sqlalchemy import Connection, delete, insert, select, update
 
 from livessl.server.forwarding.stream import outbox_name
 from livessl.server.forwarding.tables import outbox, outbox_head
+from livessl.server.forwarding.tile import Tile
 from livessl.server.history.database import Database
 from livessl.server.history.query import JsonObject
 
@@ -54,10 +55,13 @@ class Outbox:
     ----------
     database : Database
         Has the tables of `livessl.server.forwarding.tables`.
+    tile : Tile or None
+        Chooses the events for the hub; None for a site that has its room to itself, and sends all of them.
     """
 
-    def __init__(self, database: Database) -> None:
+    def __init__(self, database: Database, tile: Tile | None = None) -> None:
         self._database = database
+        self._tile = tile
         self._on_put: Callable[[], None] | None = None
 
     def on_put(self, call: Callable[[], None]) -> None:
@@ -108,7 +112,8 @@ class Outbox:
         known = {event["id"] for event, _ in found}
         final = [*found, *((event, time_ns) for event, time_ns in kept if event["id"] not in known)]
         final.sort(key=lambda each: each[1])
-        self.put_with(connection, [Outgoing("event", time_ns, event) for event, time_ns in final])
+        sent = [(event if self._tile is None else self._tile.sent(event), time_ns) for event, time_ns in final]
+        self.put_with(connection, [Outgoing("event", time_ns, event) for event, time_ns in sent if event is not None])
 
     def rename(self) -> None:
         """Give the outbox a new name, under which all messages are sent that wait now.

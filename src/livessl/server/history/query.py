@@ -67,6 +67,8 @@ class Query:
         True for events in excluded zones only, False for all others only.
     site : str or None
         Site that the event comes from, in the history of a hub.
+    copies : bool
+        Whether events are found for whose sound a hub shows another event.
     """
 
     since_ns: int | None = None
@@ -83,6 +85,7 @@ class Query:
     text: str | None = None
     excluded: bool | None = None
     site: str | None = None
+    copies: bool = True
 
 
 class Row(NamedTuple):

@@ -7,7 +7,7 @@ from typing import Any
 from sqlalchemy import ColumnElement, Connection, FromClause, Select, Tuple, and_, exists, literal, select, tuple_
 
 from livessl.server.history.query import Cursor, Page, Query, Row
-from livessl.server.history.tables import events, tags
+from livessl.server.history.tables import COPY, events, tags
 
 
 def matching(query: Query, *columns: ColumnElement[Any]) -> tuple[Select[Any], FromClause]:
@@ -33,6 +33,8 @@ def matching(query: Query, *columns: ColumnElement[Any]) -> tuple[Select[Any], F
         statement = statement.where(_is_tagged(searched, kind, name))
     if query.excluded is False:
         statement = statement.where(~_is_tagged(searched, "flag", "excluded"))
+    if not query.copies:
+        statement = statement.where(~_is_tagged(searched, "flag", COPY))
     compared = searched.c
     if query.since_ns is not None:
         statement = statement.where(compared.time_ns >= query.since_ns)

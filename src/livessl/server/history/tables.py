@@ -74,8 +74,12 @@ tags: Final = Table(
     PrimaryKeyConstraint("kind", "name", "time_ns", "number"),
     sqlite_with_rowid=False,
 )
-"""Zones, arrays and flags of the events, and in a hub their sites: one row for each, of the kind `zone`, `array`,
-`flag` or `site`. The other columns repeat those of the event that a search compares. The only flag is `excluded`."""
+"""Zones, arrays and flags of the events, and in a hub their sites and halls: one row for each, of the kind `zone`,
+`array`, `flag`, `site` or `hall`. The other columns repeat those of the event that a search compares. Flags are
+`excluded`, and in a hub `COPY`. The time of a `hall` is the end of the event."""
+
+COPY: Final = "copy"
+"""Flag of an event that a hub shows only where copies are wanted: another event is shown for its sound."""
 
 Index("event_tags_number", tags.c.number)
 Index(

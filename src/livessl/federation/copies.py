@@ -1,0 +1,190 @@
+"""Marks the events of a hall that are copies of others, in the transaction that stores the last event of a sound.
+
+An event of a hall has `copy_of`, the event that is shown instead of it, or `copies`, the events that it is shown for.
+A tag of the kind `flag` keeps copies out of searches. One of the kind `hall`, whose time is the end of the event, finds
+the events of a hall that overlap with a new one; those that come at once after their end are the last ones.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
+from itertools import groupby
+from typing import Any, Final, NamedTuple
+
+import orjson
+from sqlalchemy import ColumnElement, Connection, and_, bindparam, delete, insert, or_, select, text, update
+
+from livessl.federation.one_sound import SLACK_NS, Name, Sighting, pairs, sighting, sounds
+from livessl.server.api.encode import JsonObject
+from livessl.server.history.tables import COPY, events, tags
+
+LOCK: Final = 0x11_7E_55_3
+"""Number of the PostgreSQL lock of a transaction that stores events of halls, so that none misses those of another."""
+
+LONGEST_NS: Final = 60_000_000_000
+"""Longest event, in nanoseconds, that a site file allows. A longer one may not be found by one that ends before it."""
+
+MOST_TOGETHER: Final = 1000
+"""Most events that are compared with each other to place a new one. Sounds that follow each other without a pause, and
+overlap at two servers in turns, could connect any number."""
+
+SPANS_AT_ONCE: Final = 100
+"""Spans of time that one statement asks for."""
+
+_CHANGE: Final = update(events).where(events.c.number == bindparam("of_number")).values(body=bindparam("new_body"))
+_UNFLAG: Final = delete(tags).where(
+    tags.c.kind == "flag", tags.c.name == COPY, tags.c.time_ns == bindparam("at_ns"), tags.c.number == bindparam("of")
+)
+
+_log = logging.getLogger(__name__)
+
+Span = tuple[int, int]
+"""A time from which on events end, and one until which they begin, in nanoseconds."""
+
+
+class _Stored(NamedTuple):
+    """An event of a hall in the database: its row, its JSON, and what it says of its sound."""
+
+    row: Any
+    message: JsonObject
+    seen: Sighting
+
+
+def as_stored(message: JsonObject) -> JsonObject:
+    """Return an event as a hub stores it first: one of a hall is a copy of none."""
+    return {**message, "copy_of": None, "copies": []} if message.get("hall") else message
+
+
+def hall_tags(message: JsonObject, row: Mapping[str, Any]) -> Iterator[JsonObject]:
+    """Yield the tag by which an event of a hall is found, if it is one.
+
+    Parameters
+    ----------
+    message : JsonObject
+        The event.
+    row : mapping of str to Any
+        The columns of a tag of this event, without kind and name.
+    """
+    if message.get("hall"):
+        yield {**row, "kind": "hall", "name": _hall(message), "time_ns": sighting(message).end_ns}
+
+
+def lock_halls(connection: Connection) -> None:
+    """Let no other transaction store events of halls until this one ends; SQLite has one at a time anyway."""
+    if connection.dialect.name == "postgresql":
+        connection.execute(text("SELECT pg_advisory_xact_lock(:number)"), {"number": LOCK})
+
+
+def mark_copies(connection: Connection, stored: Iterable[JsonObject]) -> None:
+    """Decide anew about the sounds that new events belong to; call `lock_halls` before these are stored.
+
+    Parameters
+    ----------
+    connection : Connection
+        Its transaction has stored the events.
+    stored : iterable of JsonObject
+        The new events; those of no hall are left alone.
+    """
+    of_halls = sorted((message for message in stored if message.get("hall")), key=_hall)
+    for hall, messages in groupby(of_halls, _hall):
+        connected = _connected(connection, hall, [sighting(message) for message in messages])
+        changed: list[tuple[_Stored, JsonObject]] = []
+        for group in sounds([each.seen for each in connected.values()]):
+            kept, *copies = (connected[seen.name] for seen in group)
+            changed.append((kept, {"copy_of": None, "copies": [_named(copy) for copy in copies]}))
+            changed += [(copy, {"copy_of": _named(kept), "copies": []}) for copy in copies]
+        _store(connection, [each for each in changed if each[0].message | each[1] != each[0].message])
+
+
+def _hall(message: JsonObject) -> str:
+    return str(message["hall"]["name"])
+
+
+def _named(stored: _Stored) -> JsonObject:
+    return stored.seen.name._asdict()
+
+
+def _connected(connection: Connection, hall: str, new: Sequence[Sighting]) -> dict[Name, _Stored]:
+    """Return the new events, and all that may be one sound with them, or with one of those, and so on."""
+    known: dict[Name, _Stored] = {}
+    linked = {seen.name for seen in new}
+    searched: Iterable[Sighting] = new
+    while True:
+        for stored in _overlapping(connection, hall, searched):
+            known[stored.seen.name] = stored
+        further = _component([stored.seen for stored in known.values()], linked) - linked
+        if not further:
+            return {name: known[name] for name in linked}
+        linked |= further
+        if len(linked) > MOST_TOGETHER:
+            _log.warning("hall %r: %d events may be one sound in turns; later ones are not compared", hall, len(linked))
+            return {name: known[name] for name in linked}
+        searched = [known[name].seen for name in further]
+
+
+def _component(seen: Sequence[Sighting], names: Set[Name]) -> set[Name]:
+    """Return the names of the events that pairs connect with some of them."""
+    partners: dict[Name, list[Name]] = {}
+    for one, other, _ in pairs(seen):
+        partners.setdefault(one.name, []).append(other.name)
+        partners.setdefault(other.name, []).append(one.name)
+    found, waiting = set(names), list(names)
+    while waiting:
+        fresh = set(partners.get(waiting.pop(), ())) - found
+        found |= fresh
+        waiting += fresh
+    return found
+
+
+def _overlapping(connection: Connection, hall: str, searched: Iterable[Sighting]) -> Iterator[_Stored]:
+    """Yield the stored events of a hall that may overlap with some in time."""
+    columns = (*(events.c[name] for name in ("number", "time_ns", "confidence", "status", "level_dbfs")), events.c.body)
+    query = select(*columns).select_from(tags.join(events, events.c.number == tags.c.number))
+    query = query.where(tags.c.kind == "hall", tags.c.name == hall)
+    spans = _joined(searched)
+    for begin in range(0, len(spans), SPANS_AT_ONCE):
+        some = spans[begin : begin + SPANS_AT_ONCE]
+        for row in connection.execute(query.where(or_(*map(_is_within, some)))):
+            message = orjson.loads(row.body)
+            yield _Stored(row, message, sighting(message))
+
+
+def _is_within(span: Span) -> ColumnElement[bool]:
+    """Return the condition that an event overlaps with a span."""
+    first, last = span
+    return and_(tags.c.time_ns >= first, tags.c.time_ns <= last + LONGEST_NS, events.c.time_ns <= last)
+
+
+def _joined(searched: Iterable[Sighting]) -> list[Span]:
+    """Return the spans in which events may overlap with some, those that meet as one."""
+    joined: list[Span] = []
+    for first, last in sorted((seen.start_ns - SLACK_NS, seen.end_ns + SLACK_NS) for seen in searched):
+        if joined and first <= joined[-1][1]:
+            joined[-1] = joined[-1][0], max(last, joined[-1][1])
+        else:
+            joined.append((first, last))
+    return joined
+
+
+def _store(connection: Connection, changed: Sequence[tuple[_Stored, JsonObject]]) -> None:
+    """Write what has changed of the marks of events."""
+    if not changed:
+        return
+    bodies = [
+        {"of_number": stored.row.number, "new_body": orjson.dumps({**stored.message, **marks}).decode()}
+        for stored, marks in changed
+    ]
+    connection.execute(_CHANGE, bodies)
+    connection.execute(_UNFLAG, [{"at_ns": stored.row.time_ns, "of": stored.row.number} for stored, _ in changed])
+    flags = [
+        {
+            "kind": "flag",
+            "name": COPY,
+            **{name: getattr(stored.row, name) for name in ("number", "time_ns", "confidence", "status", "level_dbfs")},
+        }
+        for stored, marks in changed
+        if marks["copy_of"] is not None
+    ]
+    if flags:
+        connection.execute(insert(tags), flags)
