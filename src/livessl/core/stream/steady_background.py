@@ -4,8 +4,8 @@ Mains hum, the tone of a fan or rumble can be far above everything else in the b
 rest of the background then hardly raises the level. The background is therefore tracked in every bin of the frames'
 spectra, as the smallest power of a few seconds. Bins whose background is far above that of the others are *loud*. In a
 loud bin, only power far above the usual power counts. Bins outside the band may also be loud and leak into the band, so
-a Hann window is used if there are loud bins. (This window reduces short sounds at the edge of a frame.) Without loud
-bins, the level is the plain power in the band.
+a Hann window is used if there are loud bins. It reduces sounds at the edges of a frame and raises those in the middle.
+Without loud bins, and where a frame is far above all that is steady, the level is the plain power in the band.
 """
 
 from __future__ import annotations
@@ -28,6 +28,11 @@ EXCESS: Final = 25.0
 """Ratio of a frame's power to the usual power, 14 dB, above which sound counts in a loud bin. The usual power is the
 smallest mean of half a second, which is 0.6 of the mean for rumble. A bin with rumble exceeds this ratio in one of
 three million frames."""
+
+CLEAR: Final = 100.0
+"""Ratio of a frame's plain power to that of the quietest quarter of a second, 20 dB, from which on the level is the
+plain power. What is changing must exceed its quietest quarter of a second by `EXCESS`, too: rumble that fades does
+not."""
 
 BEYOND: Final = 1.25
 """Highest frequency at which a tone may leak into the band, relative to the upper edge of the band."""
@@ -66,8 +71,8 @@ class SteadyBackground:
         self._window = window.astype(np.float32)
         self._scale = 2.0 / (self._count**2 * float(np.square(window).mean()))
         self._band = slice(*band_bins(self._count, sample_rate_hz, band_hz))
-        bins = min(self._count // 2 + 1, round(BEYOND * self._band.stop))
-        self._bins = slice(0, bins)
+        self._bins = slice(0, min(self._count // 2 + 1, round(BEYOND * self._band.stop)))
+        values = self._bins.stop + 1  # of a spectrum; the last one is the plain power in the band
         self._latest: deque[FloatArray] = deque(maxlen=_SMOOTHING)
         self._blocks: deque[FloatArray] = deque(maxlen=max(1, round(window_s / FRAME_S / _BLOCK) - 1))
         self._of_blocks: FloatArray | None = None  # the least of all of them
@@ -75,13 +80,16 @@ class SteadyBackground:
         self._sum: FloatArray | None = None
         self._means: deque[FloatArray] = deque(maxlen=self._blocks.maxlen)
         self._frames = 0
-        self._loud: BoolArray = np.zeros(bins, dtype=np.bool_)  # another array only where other bins are loud
+        self._loud: BoolArray = np.zeros(values, dtype=np.bool_)  # another array only where other bins are loud
         self._is_any_loud = False
-        self._usual: FloatArray = np.zeros(bins)
-        self._maximum: FloatArray = np.zeros(bins)
+        self._usual: FloatArray = np.zeros(values)
+        self._maximum: FloatArray = np.zeros(values)
+        self._quietest: FloatArray = np.zeros(values)
 
     def spectra(self, samples: Float32Array, plain: ComplexArray) -> FloatArray:
-        """Return the power of some frames in each bin, mean over the channels, full scale squared: (C, F).
+        """Return the power of some frames in each bin, mean over the channels, full scale squared: (C, F + 1).
+
+        The last value of each frame is the power in the band without a window.
 
         Parameters
         ----------
@@ -95,8 +103,12 @@ class SteadyBackground:
         else:
             frames = samples[:, :, : self._count]
             spectra = scipy.fft.rfft(frames * self._window[: frames.shape[2]], self._count, axis=2)[:, :, self._bins]
-        power = np.add.reduce(spectra.real**2 + spectra.imag**2, axis=1, dtype=np.float64)
-        return np.asarray(power * (self._scale / samples.shape[1]))
+            plain = scipy.fft.rfft(frames, self._count, axis=2)
+        channels = samples.shape[1]
+        power = np.add.reduce(spectra.real**2 + spectra.imag**2, axis=1, dtype=np.float64) * (self._scale / channels)
+        inside = plain[:, :, self._band]
+        total = (inside.real**2 + inside.imag**2).sum(axis=(1, 2), dtype=np.float64)
+        return np.column_stack([power, total * (2.0 / (self._count**2 * channels))])
 
     def learn(self, spectrum: FloatArray) -> bool:
         """Take in the spectrum of the next frame; return whether it shows a hum that was not known before.
@@ -123,10 +135,11 @@ class SteadyBackground:
         self._sum = smoothed if self._sum is None else self._sum + smoothed
         self._frames += 1
         background = self._least if self._of_blocks is None else np.minimum(self._of_blocks, self._least)
+        self._quietest = background
         inside = background[self._band]
         if len(inside) >= _LEAST_BINS:
             loud = background > LOUD * _median(inside)
-            loud[0] = False
+            loud[[0, -1]] = False
             if (loud != self._loud).any():
                 self._loud, self._is_any_loud = loud, bool(loud.any())
         if self._frames % _BLOCK == 0:
@@ -152,22 +165,25 @@ class SteadyBackground:
 
         It is an upper bound: the sum of the maxima of the bins.
         """
-        return self.changing_power(self._maximum, np.inf)
+        return self.changing_power(self._maximum, float(self._maximum[-1]))
 
     def changing_power(self, spectrum: FloatArray, power: float) -> float:
         """Return the in-band power of a frame without its loud and steady parts.
 
         Parameters
         ----------
-        spectrum : (F,) float64
+        spectrum : (F + 1,) float64
         power : float
-            The plain in-band power, which is returned if no bin is loud.
+            The plain in-band power, which is returned if no bin is loud, or the frame is far above all that is steady.
         """
         if not self._is_any_loud:
             return power
         inside, loud = spectrum[self._band], self._loud[self._band]
         excess = np.maximum(inside - EXCESS * self._usual[self._band], 0.0)
-        return float(np.where(loud, excess, inside).sum())
+        changing = float(np.where(loud, excess, inside).sum())
+        quietest = float(self._quietest[self._band][~loud].sum())
+        is_clear = spectrum[-1] >= CLEAR * self._quietest[-1] and changing >= EXCESS * quietest
+        return power if is_clear else changing
 
 
 def _windowed(plain: ComplexArray, bins: int, count: int) -> ComplexArray:
