@@ -1,8 +1,9 @@
-"""`livessl capture`: runs a capture node, on its audio device or on files or a simulated scene in its place."""
+"""`livessl capture`: runs a capture node, on its audio device, or on files, a session or a simulated scene instead."""
 
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 from typing import Any
 
 from livessl.cli import argument, progress
@@ -22,6 +23,13 @@ def add_arguments(parser: Any) -> None:
     add_wav(
         parser,
         "use the sound of FILE, in real time, instead of the device; repeat the option for each array of the node",
+    )
+    parser.add_argument(
+        "--session",
+        type=Path,
+        metavar="DIR",
+        help="use a session that `livessl record` or `livessl simulate` has made, in real time, instead of the device; "
+        "the site file may give the inputs of an array in another order than when it was recorded",
     )
     parser.add_argument("--loop", action="store_true", help="if files are played: repeat them until Ctrl-C")
     parser.add_argument(

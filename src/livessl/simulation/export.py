@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import Final
@@ -56,6 +56,7 @@ def write_scene(
     *,
     seed: int,
     rates_hz: Mapping[str, float] | None = None,
+    inverted: Mapping[str, Sequence[int]] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> None:
     """Render a scene for every array of a site into a folder: `ARRAY.wav` (16 bit), `truth.jsonl`, and a session.
@@ -72,6 +73,8 @@ def write_scene(
         Seed of the microphones' own noise.
     rates_hz : mapping of array name to float, or None
         Sampling rates of arrays whose files are not written at the scene's rate.
+    inverted : mapping of array name to channels, or None
+        Channels, counted from 1, whose cables invert the signal: a fault made on purpose.
     progress : callable or None
         Called with (sources done, sources in all).
 
@@ -82,7 +85,7 @@ def write_scene(
     """
     directory.mkdir(parents=True, exist_ok=True)
     with unfinished_folder(directory, _is_own) as unfinished:
-        _write(unfinished, site, scene, seed, rates_hz or {}, progress)
+        _write(unfinished, site, scene, seed, rates_hz or {}, inverted or {}, progress)
         _take_place(unfinished, directory)
 
 
@@ -97,13 +100,16 @@ def _write(
     scene: Scene,
     seed: int,
     rates_hz: Mapping[str, float],
+    inverted: Mapping[str, Sequence[int]],
     progress: Callable[[int, int], None] | None,
 ) -> None:
     pieces = []
     for spec, samples in rendered(site, scene, seed=seed, progress=progress):
         rate_hz = rates_hz.get(spec.name, scene.sample_rate_hz)
         resampled = _resampled(samples, scene.sample_rate_hz, rate_hz)
-        soundfile.write(directory / f"{spec.name}.wav", resampled.T, round(rate_hz), subtype="PCM_16")
+        signs = np.ones((len(resampled), 1), dtype=np.float32)
+        signs[[number - 1 for number in inverted.get(spec.name, ())]] = -1.0
+        soundfile.write(directory / f"{spec.name}.wav", (signs * resampled).T, round(rate_hz), subtype="PCM_16")
         pieces.append(piece(spec.name, f"{spec.name}.wav", NOMINAL_START_NS))
     lines = "".join(json.dumps(entry) + "\n" for entry in truth(scene))
     (directory / TRUTH_FILE).write_text(lines, encoding="utf-8")

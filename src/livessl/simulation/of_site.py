@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from livessl.core.types import ArraySpec, Float32Array
-from livessl.simulation.scene import NamedSound, Scene, make_scene, render, synthesised_sounds
+from livessl.simulation.scene import GAP_S, NamedSound, Scene, make_scene, render, synthesised_sounds
 from livessl.site.load import load_site
 from livessl.site.models import Site
 
@@ -80,6 +82,7 @@ def scene_of(
     sample_rate_hz: float,
     sounds: Sequence[NamedSound] | None = None,
     seed: int,
+    gap_s: float = GAP_S,
 ) -> Scene:
     """Place sounds at random in a site's room, away from its arrays: see `simulate` and `make_scene`."""
     return make_scene(
@@ -91,7 +94,28 @@ def scene_of(
         c_m_s=site.c_m_s,
         keep_away_m=[spec.centre_m for spec in site.specs],
         seed=seed,
+        gap_s=gap_s,
     )
+
+
+def at_places(scene: Scene, places_m: Sequence[Sequence[float]]) -> Scene:
+    """Return a scene with its sounds, one after the other, at given places (x, y, z) in metres.
+
+    Raises
+    ------
+    ValueError
+        If a place is outside the room, or the number of places differs from that of the sounds.
+    """
+    x, y, z = scene.room_size_m
+    for place in places_m:
+        if not all(0.0 < at < size for at, size in zip(place, scene.room_size_m, strict=True)):
+            given = ", ".join(f"{at:g}" for at in place)
+            raise ValueError(f"--at: expected a place inside the room of {x:g} x {y:g} x {z:g} m, got {given}")
+    sources = tuple(
+        replace(source, position_m=np.array(place, dtype=np.float64))
+        for source, place in zip(scene.sources, places_m, strict=True)
+    )
+    return replace(scene, sources=sources)
 
 
 def rendered(

@@ -16,13 +16,16 @@ from scipy.signal import oaconvolve, resample_poly
 from livessl.core.geometry import as_positions_m
 from livessl.core.types import Float32Array, FloatArray, read_only
 from livessl.simulation.room import absorption, impulse_responses
-from livessl.simulation.sounds import SOUNDS
+from livessl.simulation.sounds import SOUNDS, hand_clap
 
 NamedSound = tuple[str, Float32Array]
 """Name of a sound, and its mono samples (n,)."""
 
 CLEARANCE_M: Final = 1.0
 """Least distance from a source to the centre of an array."""
+
+GAP_S: Final = 0.8
+"""Least pause, in seconds, between the reverberation of a sound and the next sound, unless another one is given."""
 
 MAX_JITTER_S: Final = 0.5
 """Longest random addition, in seconds, to the pause between sounds, so that their starts are not periodic."""
@@ -120,7 +123,7 @@ def make_scene(
     keep_away_m: ArrayLike,
     seed: int,
     lead_s: float = 1.5,
-    gap_s: float = 0.8,
+    gap_s: float = GAP_S,
     margin_m: float = 0.5,
     height_m: tuple[float, float] = (0.5, 2.2),
 ) -> Scene:
@@ -273,15 +276,25 @@ def synthesised_sounds(sample_rate_hz: float, seed: int) -> list[NamedSound]:
     ValueError
         If the sampling rate is outside `OWN_RATES_HZ`.
     """
+    _require_own_rate(sample_rate_hz)
+    return [
+        (name, sound(np.random.default_rng([seed, index]), sample_rate_hz))
+        for index, (name, sound) in enumerate(SOUNDS.items())
+    ]
+
+
+def synthesised_claps(sample_rate_hz: float, seed: int, count: int) -> list[NamedSound]:
+    """Synthesise claps of two hands, each another one; parameters and errors are those of `synthesised_sounds`."""
+    _require_own_rate(sample_rate_hz)
+    return [("clap", hand_clap(np.random.default_rng([seed, index]), sample_rate_hz)) for index in range(count)]
+
+
+def _require_own_rate(sample_rate_hz: float) -> None:
     low, high = OWN_RATES_HZ
     if not low <= sample_rate_hz <= high:
         raise ValueError(
             f"sampling rate: expected {low:g} to {high:g} Hz for the project's own sounds, got {sample_rate_hz:g}"
         )
-    return [
-        (name, sound(np.random.default_rng([seed, index]), sample_rate_hz))
-        for index, (name, sound) in enumerate(SOUNDS.items())
-    ]
 
 
 def read_sounds(directory: Path, sample_rate_hz: float) -> list[NamedSound]:

@@ -1,4 +1,4 @@
-"""Synthesises the demo's sounds (door, keys, telephone, voice), without room or position."""
+"""Synthesises sounds (door, keys, telephone, voice, hand clap), without room or position."""
 
 from __future__ import annotations
 
@@ -102,10 +102,20 @@ def voice(rng: np.random.Generator, sample_rate_hz: float) -> Float32Array:
     return _finished(sound, sample_rate_hz)
 
 
+def hand_clap(rng: np.random.Generator, sample_rate_hz: float) -> Float32Array:
+    """Synthesise one clap of two hands (0.12 s): a burst that decays within milliseconds, and the hollow of the hands.
+
+    Parameters and result are those of `door_slam`.
+    """
+    t = _times(0.12, sample_rate_hz)
+    hollow = _struck(t, 0.0, rng.uniform(500, 2200, 3), rng.uniform(0.003, 0.006, 3), rng)
+    return _finished(_burst(t, 0.0, rng.uniform(0.004, 0.008), rng) + 0.5 * hollow, sample_rate_hz)
+
+
 SOUNDS: Final[Mapping[str, Callable[[np.random.Generator, float], Float32Array]]] = MappingProxyType(
     {"door_slam": door_slam, "dropped_keys": dropped_keys, "phone": phone, "voice": voice}
 )
-"""Every sound by its name."""
+"""Every sound of the demo by its name; claps are simulated on request only."""
 
 
 def _times(duration_s: float, sample_rate_hz: float) -> FloatArray:
