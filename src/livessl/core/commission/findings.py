@@ -42,6 +42,9 @@ APART_M: Final = 0.02
 """Distance between microphones, in metres, from which sounds from different directions differ by more than
 `SAME_SIGNAL_S`."""
 
+VERIFY_CURE: Final = "clap at places that you know, and run livessl calibrate verify"
+MEASURE_CURE: Final = "measure these again, or measure all poses by claps: livessl calibrate poses --write"
+
 SILENT: Final = 1e-9
 """Power relative to the array's median below which a channel is dead: converters leave more noise."""
 
@@ -204,8 +207,15 @@ def _copies(at_m: FloatArray, observed: Sequence[Observation]) -> dict[int, tupl
     return found
 
 
-def set_up_findings(diagnosis: Diagnosis) -> Iterator[Finding]:
-    """Yield the findings about the order of channels, the poses and the speed of sound."""
+def set_up_findings(diagnosis: Diagnosis, *, at_known_places: bool = False) -> Iterator[Finding]:
+    """Yield the findings about the order of channels, the poses and the speed of sound.
+
+    Parameters
+    ----------
+    diagnosis : Diagnosis
+    at_known_places : bool
+        Whether the places of the sounds were known, so that the cure is not to make sounds at known places.
+    """
     misfit_us = 1e6 * diagnosis.misfit_s
     if diagnosis.best is not None:
         what, cure = _words(diagnosis.best)
@@ -237,7 +247,7 @@ def set_up_findings(diagnosis: Diagnosis) -> Iterator[Finding]:
             Severity.ERROR,
             0.5,
             f"the arrays contradict each other by {misfit_us:.0f} us over {diagnosis.sounds} sounds; perhaps {likely}",
-            "clap at places that you know, and run livessl calibrate verify",
+            MEASURE_CURE if at_known_places else VERIFY_CURE,
         )
 
 

@@ -111,7 +111,7 @@ def verify_set_up(site: Site, sounds: Sequence[Sequence[Observation]], places_m:
     if not delays:
         return with_inputs(site, of_channels)
     diagnosis = verify({name: microphones[name] for name in delays}, delays, places_m, site.c_m_s)
-    return with_inputs(site, [*of_channels, *set_up_findings(diagnosis)])
+    return with_inputs(site, [*of_channels, *set_up_findings(diagnosis, at_known_places=True)])
 
 
 def observed_delays(site: Site, sounds: Sequence[Sequence[Observation]]) -> tuple[Microphones, Delays]:
