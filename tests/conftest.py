@@ -72,6 +72,7 @@ LONGEST_FIRST = (
     "test_real_recordings.py",
     "test_soak.py",
     "test_examples.py",
+    "test_tutorial.py",
     "test_replayed_faults.py",
     "test_sessions.py",
     "test_localizer.py",
