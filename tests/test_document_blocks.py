@@ -52,7 +52,7 @@ def test_commands_of_shell_blocks_parse(capsys: pytest.CaptureFixture[str]) -> N
 def test_commands_in_sentences_exist_and_have_their_options(capsys: pytest.CaptureFixture[str]) -> None:
     found = inline_commands()
     assert len(found) > 100
-    unknown = []
+    unknown: list[tuple[str, ...]] = []
     for page, command in found:
         words = command.split()[1:]
         at = next((number for number, word in enumerate(words) if word in NAMES), None)

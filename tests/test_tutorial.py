@@ -11,6 +11,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import httpx
 import numpy as np
@@ -67,8 +68,10 @@ class Terminals:
         path = self._folder / f"terminal-{len(self.running)}-{time.monotonic_ns()}.txt"
         words = shlex.split(self._on_own_ports(command))[1:]
         with path.open("w", encoding="utf-8") as output:
-            options = {"cwd": self._folder, "env": self._environment, "stdout": output, "stderr": subprocess.STDOUT}
-            process = self._stack.enter_context(started(sys.executable, "-m", "livessl", *words, **options))
+            options: dict[str, Any] = {"cwd": self._folder, "env": self._environment}
+            process = self._stack.enter_context(
+                started(sys.executable, "-m", "livessl", *words, stdout=output, stderr=subprocess.STDOUT, **options)
+            )
         self.running[command] = process, path
 
     def output(self) -> str:
@@ -209,7 +212,7 @@ def test_interface_is_listed_and_taps_are_named_as_the_page_says(tmp_path: Path)
     (tmp_path / "interfaces").mkdir()
     interfaces = Interfaces(tmp_path / "interfaces")
     interfaces.add(name="UMC1820").play(_knocks((0, 2, 1, 3)))
-    options = {"cwd": tmp_path, "env": interfaces.environment}
+    options: dict[str, Any] = {"cwd": tmp_path, "env": interfaces.environment}
     python = [sys.executable, "-m", "livessl"]
     [(init, _)] = [one for one in _commands(WITH_ARRAYS, "livessl init") if "--yes" in one[0]]
     subprocess.run([*python, *init], check=True, timeout=100, **options)

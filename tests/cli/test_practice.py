@@ -112,4 +112,3 @@ def test_capture_takes_files_or_a_session(run: Run, recorded: Recorded, tmp_path
     done = run(*options, "--session", tmp_path)
     assert done.code == 2
     assert "expected a recorded session" in done.err
-
