@@ -107,6 +107,12 @@ def test_yaml_blocks_are_valid_parts_of_site_files(tmp_path: Path) -> None:
     assert {where: found for where, found in faults.items() if found} == {}
 
 
+def has(module: str, name: str) -> bool:
+    """Whether a module has a name, or a package has a module of that name."""
+    found = import_module(module)
+    return hasattr(found, name) or (hasattr(found, "__path__") and find_spec(f"{module}.{name}") is not None)
+
+
 def unresolved(code: str) -> list[str]:
     """Imports, and names after `livessl.`, that do not exist."""
     wrong = []
@@ -114,11 +120,9 @@ def unresolved(code: str) -> list[str]:
         if isinstance(node, ast.Import):
             wrong += [alias.name for alias in node.names if find_spec(alias.name) is None]
         elif isinstance(node, ast.ImportFrom):
-            module = import_module(node.module or "")
-            wrong += [f"{node.module}.{alias.name}" for alias in node.names if not hasattr(module, alias.name)]
+            wrong += [f"{node.module}.{one.name}" for one in node.names if not has(node.module or "", one.name)]
         elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "livessl":
-            name = f"livessl.{node.attr}"
-            wrong += [] if hasattr(import_module("livessl"), node.attr) or find_spec(name) else [name]
+            wrong += [] if has("livessl", node.attr) else [f"livessl.{node.attr}"]
     return wrong
 
 
