@@ -27,7 +27,7 @@ def truth(session: Path) -> list[dict[str, Any]]:
 
 
 def simulated(run: Run, site: Path, out: Path, *options: object) -> list[dict[str, Any]]:
-    done = run("simulate", "--site", site, "--out", out, "--rt60", 0, "--sample-rate", RATE_HZ, *options)
+    done = run("simulate", "--site", site, "--out", out, "--rt60", 0, "--rate", RATE_HZ, *options)
     assert done.code == 0, done.err
     return truth(out)
 
@@ -64,7 +64,7 @@ def test_only_the_inverted_microphones_have_the_other_sign(run: Run, tmp_path: P
     [
         ("--at 1,1,9", "--at: expected a place inside the room of 4 x 5 x 3 m, got 1, 1, 9"),
         ("--at 1,1,1 --count 3", "expected --at or --count, got both; remove one of them"),
-        ("--clap --events .", "expected --clap or --events, got both; remove one of them"),
+        ("--clap --sounds .", "expected --clap or --sounds, got both; remove one of them"),
         ("--inverted nroth=1", "expected one of the arrays north, south, got 'nroth'; did you mean 'north'?"),
         ("--inverted north=0", "--inverted north=0: expected microphones from 1 to 4; correct the number"),
         ("--inverted north=1 --inverted north=2", "expected each array once, got 'north' twice"),
