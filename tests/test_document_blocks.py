@@ -32,7 +32,7 @@ NAMES = {command.name for command in COMMANDS}
 
 
 def fault_of(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str | None:
-    """What the parser of the command line says about arguments; None if it accepts them."""
+    """Return the error of the command line's parser for arguments; None if it accepts them."""
     given = [PLACEHOLDERS.get(word, word) for word in arguments]
     try:
         _parser(given).parse_args(given)
@@ -108,7 +108,7 @@ def test_yaml_blocks_are_valid_parts_of_site_files(tmp_path: Path) -> None:
 
 
 def has(module: str, name: str) -> bool:
-    """Whether a module has a name, or a package has a module of that name."""
+    """Return whether a module has a name, or a package has a module of that name."""
     found = import_module(module)
     return hasattr(found, name) or (hasattr(found, "__path__") and find_spec(f"{module}.{name}") is not None)
 

@@ -45,7 +45,7 @@ def steps(track: str) -> Iterator[Step]:
 
 
 def is_printed(line: str, output: str) -> bool:
-    """Whether an output has a line of the page; measured numbers may differ, and `…` stands for any text."""
+    """Return whether an output has a line of the page; measured numbers may differ, and `…` stands for any text."""
     pattern, end = "", 0
     for number in _MEASURED.finditer(line):
         pattern += _literal(line[end : number.start()]) + _NUMBER
