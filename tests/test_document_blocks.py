@@ -86,7 +86,12 @@ def faults_of_site(text: str, folder: Path) -> list[str]:
     """The faults of a site file, or of the small site with a part of one."""
     part = yaml.safe_load(text)
     assert isinstance(part, dict)
-    around = small({"server.events_db": "events.sqlite", **({"nodes": ...} if "nodes" in part else {})})
+    around = small({"server.events_db": "events.sqlite"})
+    if "nodes" in part:
+        around["nodes"] = {}
+        names = [name for node in part["nodes"].values() for name in node["arrays"]]
+        tetrahedron = {"geometry": {"tetrahedron": {"edge_m": 0.3}}}
+        around["arrays"] = {name: tetrahedron | {"position_m": [1.0 + at, 1.0, 1.5]} for at, name in enumerate(names)}
     whole = part if {"site", "room", "arrays"} <= set(part) else with_part(around, part)
     try:
         parse_site(yaml.safe_dump(whole, sort_keys=False), "site.yaml", directory=folder)
