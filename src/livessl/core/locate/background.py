@@ -33,22 +33,23 @@ class _Known(NamedTuple):
     counted: float
 
 
-def background_lags(sound: Sound, frames: int | None = None) -> Float32Array | None:
+def background_lags(sound: Sound, frames: Sequence[int] | None = None) -> Float32Array | None:
     """Return the summed lags that frames of the background alone would have; None if the background is not known.
 
-    A background that is `FAR_BELOW` the sound is ignored, because the weights of onsets say little about power.
+    A background that is `FAR_BELOW` these frames is ignored, because the weights of onsets say little about power.
 
     Parameters
     ----------
     sound : Sound
         The sound of one array.
-    frames : int or None
-        Number of the frames; None for all frames from the beginning of the sound on.
+    frames : sequence of int or None
+        Which of the sound's `onsets`; None for all from the beginning of the sound on.
     """
-    known = _known(sound)
+    known = _known(sound, frames)
     if known is None:
         return None
-    share = known.counted * (frames or len(sound.onsets) - known.first) / len(known.frames)
+    count = len(sound.onsets) - known.first if frames is None else len(frames)
+    share = known.counted * count / len(known.frames)
     return np.float32(share) * np.asarray(summed([sound.onsets[k] for k in known.frames]).lags, dtype=np.float32)
 
 
@@ -61,8 +62,10 @@ def loud_frames(sound: Sound) -> Sequence[int]:
     return [known.first + int(k) for k in np.flatnonzero(powers >= LOUD * powers.max())]
 
 
-def _known(sound: Sound) -> _Known | None:
+def _known(sound: Sound, among: Sequence[int] | None = None) -> _Known | None:
     """Return the background in the pre-roll, without the last frames, in which the sound may begin; None if unknown.
+
+    Its weight depends on the power of some of the sound's frames, or of all.
 
     It is unknown for envelopes: these are magnitudes, which do not cancel in noise and contain no place.
     """
@@ -73,6 +76,7 @@ def _known(sound: Sound) -> _Known | None:
     frames = [k for k in range(first) if sound.onsets[k].weight > 0.0]  # not those in which the noise was learned
     if not frames or first == len(sound.onsets) or np.iscomplexobj(sound.onsets[0].lags):
         return None
-    level = float(course.powers[frames].mean()) / max(float(course.powers[first:].mean()), 1e-30)
+    powers = course.powers[first:] if among is None else course.powers[list(among)]
+    level = float(course.powers[frames].mean()) / max(float(powers.mean()), 1e-30)
     counted = min(1.0, (level - FAR_BELOW) / (COMPARABLE - FAR_BELOW))
     return _Known(frames, first, counted) if counted > 0.0 else None

@@ -79,7 +79,7 @@ class OnsetEvidence:
             if not loud[name]:
                 return part
             sound, onsets = sounds[name], summed([sounds[name].onsets[k] for k in loud[name]])
-            own = self._evidence_of(name, sound, onsets, background_lags(sound, len(loud[name])))
+            own = self._evidence_of(name, sound, onsets, background_lags(sound, loud[name]))
             return replace(own, beginning=part.beginning)
 
         return tuple(limited(part) for part in evidence)
@@ -101,7 +101,7 @@ class OnsetEvidence:
         if begun is None:
             return evidence
         parts = sound.onsets[begun]
-        own = self._evidence_of(array, sound, summed(parts), background_lags(sound, len(parts)))
+        own = self._evidence_of(array, sound, summed(parts), background_lags(sound, range(len(sound.onsets))[begun]))
         return replace(evidence, beginning=own)
 
     def _evidence_of(self, array: str, sound: Sound, onsets: OnsetGCC, background: Float32Array | None) -> Evidence:

@@ -255,7 +255,8 @@ class EvidenceCollector:
             if not stream.correlations.has(needed) and stream.has_samples(needed):  # some frames came late
                 stream.begin_correlations()
                 self._correlate([stream], range(span.start, end))
-            onsets, course = _correlated(stream, range(span.start, end), start)
+            # what is active but far below the loudest frame is the beginning of the sound, not its background
+            onsets, course = _correlated(stream, range(span.start, end), min(start, active[0]))
             if onsets or Segments(segments):
                 excerpt.sounds.add(stream.spec.name, segments, onsets, course)
         excerpt.extend(start * FRAME_NS - stream.rest_ns, end * FRAME_NS - stream.rest_ns)
