@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from clip_desk import head, recordings
 from livessl.schema.clips import ClipFile
-from livessl.server.clips.erase import PARTIAL
+from livessl.server.clips.erase import PARTIAL, erase
 from livessl.server.clips.folder import ClipFolder
 from livessl.server.clips.reader import ClipsError, UnreadableClipError, parsed
 
@@ -359,6 +359,15 @@ def test_sound_that_cannot_be_overwritten_is_deleted_nevertheless(
     assert folder.delete("lab-1")
     assert list(tmp_path.iterdir()) == []
     assert "deleted without being overwritten: No space left on device" in caplog.text
+
+
+def test_a_single_file_is_overwritten_before_it_is_deleted(tmp_path: Path) -> None:
+    sound, also = tmp_path / "sound", tmp_path / "also"
+    sound.write_bytes(b"speech")
+    os.link(sound, also)  # another name of the same bytes on the disk
+    erase(sound)
+    assert [each.name for each in tmp_path.iterdir()] == ["also"]
+    assert also.read_bytes() == bytes(6)
 
 
 def test_clip_that_could_not_be_erased_is_erased_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,7 +17,7 @@ _log = logging.getLogger(__name__)
 
 
 class Wastebasket:
-    """Folders of clips that were deleted, and wait for being erased. Every thread may call it.
+    """Folders of clips that were deleted, and wait to be erased. Every thread may call it.
 
     Parameters
     ----------
@@ -30,11 +30,11 @@ class Wastebasket:
         self._lock = threading.Lock()  # is never held while waiting for another lock
 
     def place_of(self, event_id: str) -> Path:
-        """Return the name under which the clip of an event waits."""
+        """Return the folder to which the clip of an event is renamed when it is deleted, until it is erased."""
         return self._path / f"{PARTIAL}going-{event_id}"
 
     def erase(self, folder: Path) -> None:
-        """Erase a folder; two threads may do so at once.
+        """Erase a folder; calls from several threads run one after another.
 
         Raises
         ------
@@ -50,7 +50,7 @@ class Wastebasket:
         Raises
         ------
         OSError
-            If one of them cannot be erased; the others are.
+            If any cannot be erased. All others are tried, and the last error is raised.
         """
         failed: OSError | None = None
         for folder in self._path.glob(f"{PARTIAL}going-*"):
@@ -63,7 +63,7 @@ class Wastebasket:
 
 
 def write_through(path: Path, data: bytes) -> None:
-    """Write a file to the disk itself, so that its content is there before a rename, even if the power fails.
+    """Write a file and wait until the disk has it (fsync), so that a rename after it is safe if the power fails.
 
     Raises
     ------
@@ -77,7 +77,7 @@ def write_through(path: Path, data: bytes) -> None:
 
 
 def erase(folder: Path) -> None:
-    """Overwrite a folder's files with zeros and delete it; on some disks and file systems copies remain.
+    """Overwrite the files of a folder, or a single file, with zeros and delete it; on some disks copies remain.
 
     A file that cannot be overwritten is deleted nevertheless.
 
@@ -88,13 +88,14 @@ def erase(folder: Path) -> None:
     """
     if not folder.exists():
         return
-    for path in folder.rglob("*"):
+    for path in (folder, *folder.rglob("*")):
         try:
             if path.is_file() and not path.is_symlink():
                 overwrite(path)
         except OSError as error:
             _log.warning(
-                "%s: deleted without being overwritten: %s; its sound may remain on the disk, check the disk",
+                "%s: deleted without being overwritten: %s; its sound may still be readable on the disk; "
+                "overwrite the free space if that matters",
                 path,
                 error.strerror or error,
             )

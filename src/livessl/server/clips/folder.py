@@ -199,7 +199,7 @@ class ClipFolder(ClipReader):
         Raises
         ------
         OSError
-            If one of them cannot be erased; the others are.
+            If any cannot be erased. All others are tried, and the last error is raised.
         """
         self._wastebasket.empty()
 
