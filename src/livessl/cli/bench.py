@@ -63,7 +63,7 @@ def add_arguments(parser: Any) -> None:
     only.add_argument(
         "--spin",
         action="store_true",
-        help="keep every core busy with another process meanwhile, to measure a server on a busy machine",
+        help="run one busy process on each core during the measurement, to measure a server on a busy machine",
     )
     only.set_defaults(**LIVE_DEFAULTS)
     add_json(parser, "print one JSON object")

@@ -36,8 +36,8 @@ if TYPE_CHECKING:
 WAIT_S: Final = 120.0
 """Default of --wait: time to measure the next place and to walk there, seconds."""
 
-POSITION_STD_M: Final = 0.1
-"""Default of --position-std, metres."""
+TAPE_STD_M: Final = 0.1
+"""Default of --position-std, metres: the place of an array in the room, measured by tape."""
 
 REFINED_SOUNDS: Final = 20
 """Default of --count."""
@@ -59,7 +59,7 @@ def _add_verify(actions: Any) -> None:
         "print the error of claps at places that you know, and its likely cause",
         "verify --site site.yaml --at 2,3,1.2 --at 6,8,1.2",
     )
-    _add_places(sub, "place of a clap in metres; repeat for each, in the order in which they are made")
+    _add_places(sub, "place of a clap in metres; repeat the option for each clap, in the order of the claps")
     add_truth(sub)
     add_json(sub, "print one JSON object for each clap and each finding")
 
@@ -108,10 +108,10 @@ def _add_refine(actions: Any) -> None:
     sub.add_argument(
         "--position-std",
         type=argument.above_zero,
-        default=POSITION_STD_M,
+        default=TAPE_STD_M,
         metavar="M",
-        help="standard deviation, in metres, of the errors of the arrays' positions in the site file "
-        f"(default: {POSITION_STD_M:g}, as measured by tape)",
+        help="standard deviation, in metres, of the errors of the arrays' places in the room, as the site file gives "
+        f"them (default: {TAPE_STD_M:g}, as measured by tape; microphones within an array have much smaller errors)",
     )
     count = sub.add_argument(
         "--count",
@@ -151,7 +151,7 @@ def _action(
         type=argument.above_zero,
         default=WAIT_S,
         metavar="S",
-        help=f"longest wait, in seconds, for each sound of a running server (default: {WAIT_S:g})",
+        help=f"longest wait, in seconds, for a running server to report the next sound (default: {WAIT_S:g})",
     )
     return sub
 

@@ -31,13 +31,13 @@ def add_arguments(parser: Any) -> None:
         help="use a session that `livessl record` or `livessl simulate` has made, in real time, instead of the device; "
         "the site file may give the inputs of an array in another order than when it was recorded",
     )
-    parser.add_argument("--loop", action="store_true", help="if files are played: repeat them until Ctrl-C")
+    parser.add_argument("--loop", action="store_true", help="with --wav or --session: repeat the files until Ctrl-C")
     parser.add_argument(
         "--start-at",
         type=argument.time,
         metavar="TIME",
-        help="if files are played: time stamp of their first sample, RFC 3339 (default: now, or the next multiple of "
-        "5 s if the site has several nodes, so that all start together)",
+        help="with --wav or --session: time stamp of the files' first sample, RFC 3339 (default: now, or the next "
+        "multiple of 5 s if the site has several nodes, so that all start together)",
     )
 
 

@@ -27,7 +27,7 @@ def add_arguments(parser: Any) -> None:
         type=argument.rt60,
         default=0.7,
         metavar="S",
-        help="reverberation time to assume for the expected error, seconds (default: 0.7)",
+        help="reverberation time, seconds, assumed when the error is predicted (default: 0.7)",
     )
     parser.add_argument("--png", type=Path, metavar="FILE", help="also draw floor plan, side view and arrays to FILE")
     add_json(parser, "print one JSON object")

@@ -18,7 +18,7 @@ def add_arguments(parser: Any) -> None:
     sub = actions.add_parser(
         "show",
         help=text,
-        description=f"{text[0].upper()}{text[1:]}. The output is a valid site file.",
+        description=f"{text[0].upper()}{text[1:]}. Without --json the output is a valid site file.",
         epilog="example: livessl config show site.yaml",
     )
     sub.add_argument("site", type=Path, help="site file")

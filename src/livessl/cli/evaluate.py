@@ -110,8 +110,8 @@ def _add_simulation(group: Any) -> None:
     add(
         "--snr",
         metavar="DB[,DB…]",
-        help="white sensor noise to add, as signal-to-noise ratio in dB (mean power of the recording over that of the "
-        f"noise); inf adds none; only {LOCALIZER} accepts several values (default: inf)",
+        help="signal-to-noise ratio, dB, of the white sensor noise to add: mean power of the recording over that of "
+        f"the noise; inf: none; only {LOCALIZER} accepts several values (default: inf)",
     )
     rate = add(
         "--rate",

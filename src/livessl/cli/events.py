@@ -32,8 +32,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=_kinds,
         default=("event",),
         metavar="KIND,KIND,…",
-        help=f"messages to print: {', '.join(KINDS)}; arrays: their states have changed; zone: a track has entered or "
-        "left a zone or loiters there; zones: the zones have changed; poses: other poses are in force (default: event)",
+        help=f"messages to print: {', '.join(KINDS)}; arrays: a state has changed; zone: a track has entered or "
+        "left a zone or loiters there; zones: a zone was added, changed or removed; poses: arrays have "
+        "new poses (default: event)",
     )
     add(
         "--zone",
@@ -51,7 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--track",
         type=argument.count,
         metavar="N",
-        help="of all tracks and their changes in zones, print only those of track N; other kinds are not affected",
+        help="print tracks and zone changes of track N only; other kinds are not affected",
     )
     add(
         "--max-rate",

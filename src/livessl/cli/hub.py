@@ -21,8 +21,8 @@ def add_arguments(parser: Any) -> None:
         required=True,
         metavar="FILE",
         help="the hub's settings (YAML). `nats` and `database` are required, such as: "
-        '{nats: {servers: ["nats://127.0.0.1:4222"]}, database: hub.sqlite}. Further keys are `http` as in a site '
-        "file, `stream`, `retention_days` and `hub`, the hub's name",
+        '{nats: {servers: ["nats://127.0.0.1:4222"]}, database: hub.sqlite}. Further keys are `http` (as '
+        "`server.http` of a site file), `stream`, `retention_days` and `hub`, the hub's name",
     )
 
 

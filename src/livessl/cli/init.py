@@ -20,7 +20,7 @@ def add_arguments(parser: Any) -> None:
     _add_arrays(parser)
     _add_interfaces(parser)
     parser.add_argument(
-        "--yes", action="store_true", help="ask nothing; use the default of everything that is not given"
+        "--yes", action="store_true", help="ask nothing; use defaults for all that the options do not give"
     )
     parser.add_argument("--force", action="store_true", help="replace a file that exists")
     parser.add_argument(
@@ -55,9 +55,10 @@ def _add_arrays(parser: Any) -> None:
         default=[],
         metavar="NAME=KIND[:SIZE[xCOUNT]][@X,Y,Z[@YAW]]",
         help=f"array to add; repeat the option for each array. KIND is {', '.join(list(SIZE_M)[:-1])} or "
-        f"{list(SIZE_M)[-1]}; SIZE is its edge, the spacing of a line or the radius of a circle, in metres; COUNT is "
-        "the number of microphones of a line or circle (default: 4); X,Y,Z is the array's centre in metres; YAW turns "
-        "it about the vertical axis, in degrees, counterclockwise seen from above. What is left out is proposed",
+        f"{list(SIZE_M)[-1]}; SIZE is, in metres, the edge of a tetrahedron or square, the spacing of a line's "
+        "microphones or a circle's radius; COUNT is the number of microphones of a line or circle (default: 4); "
+        "X,Y,Z is the array's centre in metres; YAW turns it about the vertical axis, in degrees, counterclockwise "
+        "seen from above. Omitted parts get a proposed value",
     )
     parser.add_argument("--arrays", type=draft_arguments.array_count, metavar="N", help="number of arrays (default: 2)")
 

@@ -23,7 +23,10 @@ def add_arguments(parser: Any) -> None:
     parser.add_argument("--node", help="name of the node in the site file")
     parser.add_argument("--wav", type=Path, metavar="FILE", help="meter a WAV or FLAC file instead of a device")
     parser.add_argument(
-        "--inputs", type=argument.positive, metavar="N", help="number of inputs (default: all that the device has)"
+        "--inputs",
+        type=argument.positive,
+        metavar="N",
+        help="number of inputs (default: all that an interface has; 8 of a sound server or plug-in)",
     )
     rate = parser.add_argument(
         "--rate",

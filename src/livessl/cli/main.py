@@ -71,7 +71,7 @@ COMMANDS: Final = (
     ),
     Command(
         "evaluate",
-        "compare methods in simulated rooms, repeat a paper's experiments, or report on earlier results",
+        "compare methods in simulated rooms, repeat the paper's experiments, or report on earlier results",
         "livessl evaluate one-array --sounds sounds/ --positions 10 --out evaluation/",
     ),
     Command(
@@ -116,9 +116,9 @@ COMMANDS: Final = (
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; return its exit code.
 
-    0 means success, also if Ctrl-C or SIGTERM ended a command that runs until then; 1 means a failure at run time;
-    2 means wrong use or an invalid configuration; 130 means that Ctrl-C or SIGTERM interrupted a command that ends by
-    itself.
+    0 means success, also if Ctrl-C or SIGTERM ended a command that runs until then, or if the program that reads the
+    output has ended; 1 means a failure at run time, or that the command found faults; 2 means wrong use or an invalid
+    configuration; 130 means that Ctrl-C or SIGTERM interrupted a command that ends by itself.
     """
     # matrix products are small here: a second BLAS thread mostly waits in a loop, and CPU time grows eightfold
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # for a library that is loaded later

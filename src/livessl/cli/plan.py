@@ -36,8 +36,8 @@ def add_arguments(parser: Any) -> None:
         type=argument.above_zero,
         default=CALIBRATION_M,
         metavar="M",
-        help="assumed error of the microphones' positions in the site file (standard deviation, metres); a larger one "
-        f"makes the predicted error larger (default: {CALIBRATION_M:g})",
+        help="assumed error of the position of each microphone within its array (standard deviation, metres); a larger "
+        f"one makes the predicted error larger (default: {CALIBRATION_M:g})",
     )
     add_json(parser, "print one JSON object")
     parser.add_argument(

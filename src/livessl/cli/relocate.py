@@ -39,7 +39,7 @@ def add_arguments(parser: Any) -> None:
     add = parser.add_argument
     add("clips", type=Path, nargs="?", help="folder of clips (default: server.clips of the site file)")
     parser.add_argument(
-        "--site", type=Path, help="site file of the clips; required, unless --url is given, which excludes it"
+        "--site", type=Path, help="site file of the clips; required without --url, and not allowed with it"
     )
     add_server(
         parser,
@@ -52,7 +52,7 @@ def add_arguments(parser: Any) -> None:
         "--set-up",
         choices=("then", "now"),
         default="then",
-        help="`then`: poses and speed of sound with which the event was located at the time; `now`: those of the site "
+        help="`then`: poses and speed of sound of the time of the event; `now`: those of the site "
         "file and its calibration file (with --url: those in force at the server) (default: then)",
     )
     add("--since", type=argument.time, metavar="TIME", help="only events that began at TIME or later (RFC 3339)")
@@ -61,7 +61,8 @@ def add_arguments(parser: Any) -> None:
         "--out",
         type=Path,
         metavar="FILE",
-        help="append the results to FILE, one JSON object per line, and skip events that have a result in FILE",
+        help="write the results to FILE, one JSON object per line; skip events that FILE has located already, and "
+        "try failed ones again, whose lines are replaced",
     )
     add("--jobs", type=argument.positive, help="number of parallel processes (default: one per core)")
     add_json(parser)

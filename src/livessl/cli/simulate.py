@@ -29,8 +29,8 @@ def add_arguments(parser: Any) -> None:
         "--sounds",
         type=Path,
         metavar="DIR",
-        help="folder of sound files, WAV or FLAC, to place in the room (default: built-in sounds); --count is the "
-        "number of sounds",
+        help="folder of sound files, WAV or FLAC, to place in the room (default: built-in sounds); "
+        "--count of them are used",
     )
     add_older_name(parser, "--events", sounds)
     parser.add_argument(

@@ -35,7 +35,7 @@ KEPT: Final = 16
 MOST_SOUNDS: Final = 40
 """Most sounds, the newest ones, from which poses are refined: older ones may be from before an array was moved."""
 
-POSITION_STD_M: Final = 0.1
+TAPE_STD_M: Final = 0.1
 """Default standard deviation, in metres, of the arrays' positions in the site file before they are refined: as measured
 by tape."""
 
@@ -154,7 +154,7 @@ class Proposals:
         )  # fmt: skip
         return self._keep(proposal)
 
-    def by_sounds(self, known: Collection[str], position_std_m: float = POSITION_STD_M) -> Proposal:
+    def by_sounds(self, known: Collection[str], position_std_m: float = TAPE_STD_M) -> Proposal:
         """Refine the poses of all arrays but the known ones by the last sounds, wherever these were.
 
         Raises
@@ -172,7 +172,7 @@ class Proposals:
         site: Site,
         sounds: Sequence[HeardSound],
         known: Collection[str],
-        position_std_m: float = POSITION_STD_M,
+        position_std_m: float = TAPE_STD_M,
         *,
         is_of_thread: bool = False,
     ) -> Proposal:

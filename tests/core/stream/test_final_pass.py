@@ -233,7 +233,7 @@ def test_what_was_given_up_once_is_forgotten_when_an_array_has_caught_up() -> No
     reception.forget(150)  # given up from 101 on
     reception.take_mark(400)
     reception.forget(380)
-    assert reception.is_new(140)
+    assert reception.is_first_arrival(140)
     reception.forget(450)  # given up from 401 on
-    assert not reception.is_new(140)
-    assert reception.is_new(420)
+    assert not reception.is_first_arrival(140)
+    assert reception.is_first_arrival(420)

@@ -333,7 +333,7 @@ def test_events_of_a_zone_and_confidence(client: httpx.Client) -> None:
         ({"min_level_dbfs": "loud"}, 422, "valid number"),
         ({"text": ""}, 422, "at least 1 character"),
         ({"after": "rubbish"}, 422, "after: expected the previous_cursor of a page, got 'rubbish'"),
-        ({"after": "1-1", "cursor": "1-1"}, 422, "expected cursor or after, got both"),
+        ({"after": "1-1", "cursor": "1-1"}, 422, "expected either cursor or after, got both"),
         ({"cursor": "rubbish"}, 422, "cursor: expected the next_cursor of a page, got 'rubbish'"),
         ({"cursor": 10**30}, 422, "cursor: expected the next_cursor of a page"),
     ],

@@ -176,7 +176,9 @@ def test_clip_that_does_not_fit_says_why(tmp_path: Path) -> None:
     with pytest.raises(RelocationError, match="no active frame of it: frames are missing; see its gaps_s"):
         relocate(site, folder, second, "onset", "then")
     path.write_bytes(orjson.dumps({name: value for name, value in about.items() if name != "arrays"}))
-    with pytest.raises(RelocationError, match=r"are of an earlier release, .*; locate them with `livessl locate --wav"):
+    with pytest.raises(
+        RelocationError, match=r"are of an earlier release, .*; locate them with `livessl locate --site SITE --wav"
+    ):
         relocate(site, folder, second, "onset", "then")
 
 
@@ -199,7 +201,7 @@ DAMAGES: dict[str, tuple[str, Any, str]] = {
     "files of another form": ("files", ["a.flac"], r"files\.0: input should be an object, got 'a\.flac'"),
     "no file of an array": ("files", [], "'north' is missing"),
     "short row": ("arrays.south.frames", [[1, 2, 3]], r"not enough values"),
-    "begin before the recording": ("arrays.south.frames", [[1, -2, 3, 0.1, True, False]], "a begin of 0 or more"),
+    "begin before the recording": ("arrays.south.frames", [[1, -2, 3, 0.1, True, False]], "a start of 0 or more"),
     "frame beyond the recording": (
         "arrays.south.frames",
         [[INDEX, 10**9, 3, 0.1, True, False]],
@@ -215,8 +217,8 @@ DAMAGES: dict[str, tuple[str, Any, str]] = {
     "arrays of another form": ("arrays", ["north"], "has no attribute 'items'"),
     "no answer": ("answer", ..., "'answer' is missing"),
     "answer of another form": ("answer.position_m", [1.0], "not enough values"),
-    "answer in words": ("answer.confidence", "0.9", "a confidence and a position in numbers"),
-    "position in words": ("answer.position_m", ["1", "2", "3"], "a confidence and a position in numbers"),
+    "answer in words": ("answer.confidence", "0.9", "a confidence and a position as numbers"),
+    "position in words": ("answer.position_m", ["1", "2", "3"], "a confidence and a position as numbers"),
 }
 
 

@@ -1,4 +1,7 @@
-"""GCC-PHAT of one array: cross-correlation with phase transform, band-limited, on a fine lag axis.
+"""GCC-PHAT of one array: cross-correlation with phase transform, interpolated to a fine lag axis.
+
+It is band-limited; the fine lag axis has `OVERSAMPLING` lags a sample, and `LagSampling` interpolates between the whole
+lags. `locate/srp.py` takes the nearest fine lag of each grid point.
 
 The sign of a lag is defined here and nowhere else: *positive lag of pair (i, k): the sound reaches channel k later*.
 The paper's SRP equation has the opposite sign, which would mirror the map.

@@ -1,6 +1,7 @@
-"""SRP-PHAT: maps a GCC onto the grid, with the weight 2/K by which an array of K microphones counts in the sum.
+"""SRP-PHAT: maps a GCC onto the grid by the nearest fine lag, with the weight 2/K of an array of K microphones.
 
-It also interpolates the map between grid points; `contributing` decides which arrays count at all.
+GCCs are interpolated to fine lags in `gcc_phat`; between fine lags, for places off the grid, by `interpolated` of
+`kernels/with_numpy.py`. `contributing` decides which arrays count at all.
 
 SRP(r) = 2/K sum_{i<k} R_ik(tau_ik(r)) with tau_ik(r) = (|r - r_k| - |r - r_i|) / c and the lag's sign of `gcc_phat`.
 Of the delays of K(K-1)/2 pairs only K-1 are independent. The factor 2/K gives every array the weight of its independent

@@ -1,4 +1,7 @@
-"""The sound of all arrays from which an event or window is located, as estimators take it. It decides nothing."""
+"""The sound of all arrays from which an event or window is located, and its loudness (greatest frame power).
+
+Estimators take it in this form. It makes no verdict.
+"""
 
 from __future__ import annotations
 

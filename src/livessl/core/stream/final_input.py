@@ -105,7 +105,7 @@ class FinalInput:
         if is_backlog:
             reception.take_backlog(own)
         if own in reception.seen or (settled is not None and frame_index < settled):
-            (self.too_late if reception.is_new(own) else self.duplicates)[message.array] += 1
+            (self.too_late if reception.is_first_arrival(own) else self.duplicates)[message.array] += 1
             return False
         reception.add(own)
         self.held.push(message, frame_index, now_ns)

@@ -1,7 +1,7 @@
 """Records which frames of one array have arrived for the final pass, live and as backlog.
 
 Frame indices are those of the array's own clock. A node that reconnects sends its backlog between live frames. Until
-the backlog is complete, frames are complete only up to the last backlog frame, even if later live frames have arrived.
+the backlog has arrived, `known_until` is the last backlog frame, even if later live frames have arrived.
 The early pass uses `ArrayStream` instead.
 """
 
@@ -21,12 +21,12 @@ class FinalReception:
     live_from: int | None = None  # frames before it are backlog
     last_message_ns: int | None = None
     has_left: bool = False
-    given_up: tuple[int, int] | None = None  # frame indices from and before which results are final without its frames
+    given_up: tuple[int, int] | None = None  # half-open range of frame indices whose results are final without it
     seen: set[int] = field(default_factory=set)
 
     @property
     def known_until(self) -> int | None:
-        """Frame index up to which all frames have arrived; None before the first message."""
+        """Frame index up to which all frames have arrived; None until the first frame, mark or backlog is announced."""
         return self.live_until if self.backlog_until is None else self.backlog_until
 
     def is_connected(self, now_ns: int) -> bool:
@@ -64,15 +64,18 @@ class FinalReception:
         self.last_message_ns, self.has_left = now_ns, False
 
     def take_mark(self, frame_index: int) -> None:
-        """Take in a mark, with which all live frames up to its frame index have arrived."""
+        """Take in a mark. It proves that all live frames up to its frame index have arrived."""
         self.live_until = later(self.live_until, frame_index)
 
     def take_backlog(self, frame_index: int) -> None:
-        """Take in the index of a backlog frame, new or not, with which the backlog up to it has arrived."""
+        """Take in the index of a backlog frame, new or not. It proves that the backlog up to it has arrived."""
         self.backlog_until = later(self.backlog_until, frame_index)
 
-    def is_new(self, frame_index: int) -> bool:
-        """Return whether a frame has not arrived before: it is newer than all live sound, or was no longer awaited."""
+    def is_first_arrival(self, frame_index: int) -> bool:
+        """Return whether a frame from before the watermark arrives for the first time, not again.
+
+        It does if it is newer than all live sound, or if results became final without it.
+        """
         is_newest = self.live_until is not None and self.live_until < frame_index
         is_given_up = self.given_up is not None and self.given_up[0] <= frame_index < self.given_up[1]
         return frame_index not in self.seen and (is_newest or is_given_up)
@@ -84,9 +87,9 @@ class FinalReception:
             self.live_until = later(self.live_until, frame_index)
 
     def forget(self, before: int) -> None:
-        """Forget the frames before a frame index before which all results are final."""
+        """Forget the frames below `before`, the watermark; all results before it are final."""
         known, given_up = self.known_until, self.given_up
-        if known is None:  # it has sent nothing in this run, of which `before` is the first such frame index
+        if known is None:  # nothing has arrived from the array since the start; a range that is new begins at `before`
             self.given_up = (before if given_up is None else given_up[0], before)
         elif known + 1 < before:
             goes_on = given_up is not None and known + 1 < given_up[1]

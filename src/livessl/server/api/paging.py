@@ -1,4 +1,4 @@
-"""Pages of events: page size (limit), cursors, and answers with an ETag; for the histories of a server and of a hub."""
+"""Pages of events (limit, cursors) of a server and of a hub, and answers of any kind with an ETag."""
 
 from __future__ import annotations
 
@@ -17,11 +17,17 @@ from livessl.server.history.query import Query as EventQuery
 UNCHANGED: Final[dict[int | str, dict[str, Any]]] = {
     304: {"description": "Nothing has changed since the answer with the ETag in `If-None-Match`."}
 }
-"""Description for OpenAPI of the 304 with which `cached` answers a client that has the answer already."""
+"""OpenAPI description of status 304, which `cached` returns if the client's copy is current."""
 
 
 def paged(searched: Any) -> Any:
-    """Return the dependency of a route that lists events: the filters of `searched`, `limit`, `cursor` and `after`."""
+    """Return the dependency of a route that lists events.
+
+    Parameters
+    ----------
+    searched : Any
+        Dependency (`fastapi.Depends`) that reads the filters of the events; `limit`, `cursor` and `after` are added.
+    """
 
     def page(
         query: EventQuery = searched,
@@ -35,7 +41,7 @@ def paged(searched: Any) -> Any:
         ] = None,
     ) -> EventQuery:
         if cursor is not None and after is not None:
-            raise unprocessable("after", "after: expected cursor or after, got both; leave one out")
+            raise unprocessable("after", "after: expected either cursor or after, got both; leave one out")
         return replace(query, limit=limit, before=page_cursor(cursor), after=page_cursor(after, "after"))
 
     return Depends(page)

@@ -51,8 +51,8 @@ class UnreadableClipError(RunError):
     def _text(event_id: str, what: str) -> str:
         return (
             f"event {event_id!r}: expected a {ABOUT} that this release can read, got another one: {what}; the file "
-            "is damaged or of another release. Locate the event from its recordings with `livessl locate --wav "
-            "ARRAY=FILE`, or delete the recordings"
+            "is damaged or of another release. Locate the event from its recordings with `livessl locate --site SITE "
+            "--wav ARRAY=FILE`, or delete the recordings"
         )
 
 

@@ -1,7 +1,7 @@
-"""Reads from a clip what locating its event again needs, and words why an event cannot be located again.
+"""Reads from a clip the data for locating its event again, and words why an event cannot be located again.
 
-`reader.py` has checked the fields of `clip.json` that every use of a clip needs. The fields that only locating again
-needs are checked here.
+`reader.py` has checked the fields of `clip.json` that every use of a clip needs. The fields that are needed only to
+locate an event again are checked here.
 """
 
 from __future__ import annotations
@@ -21,15 +21,16 @@ from livessl.server.clips.cut import CutFrame
 from livessl.server.clips.reader import ABOUT, Clip, ClipReader, UnreadableClipError
 
 MOST_BYTES: Final = 256_000_000
-"""Most bytes of decoded samples that a server holds to locate one event again. A sound of 60 s, the longest event, at
-48 kHz from five arrays of four microphones takes 230 MB. A server that runs out of memory loses live sound."""
+"""Most bytes of decoded samples that a server holds to locate one event again. A sound of 60 s, the largest
+`max_event_s` allowed, at 48 kHz from five arrays of four microphones takes 230 MB. A server that runs out of memory
+loses live sound."""
 
-MOST_OFF_S: Final = 3600.0
+MOST_DISTANCE_S: Final = 3600.0
 """Largest difference, in seconds, between the start of the event and a frame of its clip. The fusion steps through all
 frame indices between the first and the last, so a damaged index could keep it busy for ever."""
 
-# Limits of the numbers in a clip, at least as wide as those of a site file. A correlation is as long as the sound takes
-# across an array, so a damaged number could fill the memory.
+# Limits of the numbers in a clip, at least as wide as those of a site file. The length of a correlation
+# grows with an array's size and its sampling rate, so a damaged number could fill the memory.
 
 _SPEEDS_M_S: Final = (100.0, 2000.0)
 """Lowest and highest speed of sound, m/s."""
@@ -65,12 +66,13 @@ class StoredArray:
     file : str
         Name of its recording.
     microphones_m : (K, 3) float64
-        Positions by which the event was located, metres.
+        Positions with which the event was located, metres.
     uncertainty : Uncertainty
     time_ns : int
         Site time of the recording's first sample, in nanoseconds.
     sample_rate_hz : float
     rows : tuple of CutFrame
+        Its frames, in order.
     """
 
     name: str
@@ -106,9 +108,10 @@ class StoredSound:
         The clip itself.
     duration_s : float
     c_m_s : float
-        Speed of sound by which the event was located, m/s.
+        Speed of sound with which the event was located, m/s.
     answer : mapping
-        The event as it was located, as the API encodes it: `method`, `status`, `confidence` and `position_m` are there.
+        The event as it was located, as the API encodes it; it has at least `method`, `status`, `confidence` and
+        `position_m`.
     arrays : tuple of StoredArray
     """
 
@@ -125,12 +128,12 @@ class StoredSound:
 
     @property
     def start_ns(self) -> int:
-        """Begin of the event, nanoseconds since the epoch."""
+        """Start of the event, nanoseconds since the epoch."""
         return self.clip.start_ns
 
 
 def is_relocatable(clip: Clip) -> bool:
-    """Return whether a clip describes its frames, which locating again needs; clips of earlier releases do not."""
+    """Return whether a clip describes its frames, which are needed to locate its event again; older clips do not."""
     return bool(clip.content.get("arrays"))
 
 
@@ -165,7 +168,7 @@ def stored_sound(clip: Clip) -> StoredSound:
     if not is_relocatable(clip):
         raise RelocationError(
             f"the recordings of {clip.event_id!r} are of an earlier release, which did not store where frames begin; "
-            "locate them with `livessl locate --wav ARRAY=FILE`"
+            "locate them with `livessl locate --site SITE --wav ARRAY=FILE`"
         )
     try:
         return _parsed(clip)
@@ -180,6 +183,7 @@ def check_memory(sound: StoredSound, most_bytes: int) -> None:
     Raises
     ------
     RelocationError
+        If they take more.
     """
     nbytes = sum(array.nbytes for array in sound.arrays)
     if nbytes > most_bytes:
@@ -198,7 +202,7 @@ def stored_frames(sound: StoredSound, array: StoredArray) -> list[Frame]:
     NoClipError
         If the recording has been deleted meanwhile.
     RelocationError
-        If it cannot be read, or if its number of channels or its length differs from what `clip.json` states.
+        If it cannot be read, or if it has other channels or fewer samples than `clip.json` states.
     """
     event_id, path = sound.event_id, sound.clip.file(array.file)
     if path is None:
@@ -265,9 +269,9 @@ def _parsed(clip: Clip) -> StoredSound:
     for array in found.arrays:
         for row in array.rows:
             off_s = (row.frame_index * FRAME_NS - found.start_ns) / 1e9
-            if abs(off_s) > MOST_OFF_S:
+            if abs(off_s) > MOST_DISTANCE_S:
                 raise ValueError(
-                    f"arrays.{array.name}.frames: expected frames within {MOST_OFF_S:.0f} s of the event, "
+                    f"arrays.{array.name}.frames: expected frames within {MOST_DISTANCE_S:.0f} s of the event, "
                     f"got one {off_s:.0f} s from it"
                 )
     return found
@@ -275,11 +279,11 @@ def _parsed(clip: Clip) -> StoredSound:
 
 def _answer(answer: Mapping[str, Any]) -> Mapping[str, Any]:
     if not isinstance(answer["method"], str) or not isinstance(answer["status"], str):
-        raise TypeError(f"answer: expected a method and a status in words, got {answer!r}")
+        raise TypeError(f"answer: expected a method and a status as texts, got {answer!r}")
     position_m = answer["position_m"]
     numbers = [answer["confidence"], *([] if position_m is None else position_m)]
     if not all(isinstance(number, int | float) for number in numbers):
-        raise TypeError(f"answer: expected a confidence and a position in numbers, got {numbers!r}")
+        raise TypeError(f"answer: expected a confidence and a position as numbers, got {numbers!r}")
     if position_m is not None:
         _x, _y, _z = position_m
     return answer
@@ -307,7 +311,7 @@ def _row(name: str, row: Sequence[Any]) -> CutFrame:
     index, begin, length, power, active, requested = row
     found = CutFrame(int(index), int(begin), int(length), float(power), bool(active), bool(requested))
     if found.begin < 0 or found.length <= 0:
-        raise ValueError(f"arrays.{name}.frames: expected a begin of 0 or more and a length above 0, got {row!r}")
+        raise ValueError(f"arrays.{name}.frames: expected a start of 0 or more and a length above 0, got {row!r}")
     return found
 
 

@@ -18,8 +18,8 @@ from livessl.server.history.database import Database
 from livessl.server.history.query import JsonObject
 
 MAX_UNSENT: Final = 2_000_000
-"""Most messages that wait, about 3 GB: three weeks of a site with 100 000 events a day. Beyond it the oldest are given
-up; their numbers are missing at the hub, which counts them."""
+"""Most messages that wait, about 3 GB: three weeks of a site with 100 000 events a day. Beyond it the oldest are
+deleted. The hub notices the missing numbers and counts the lost messages."""
 
 
 class Outgoing(NamedTuple):
@@ -39,7 +39,7 @@ class Unsent(NamedTuple):
 
 
 class Head(NamedTuple):
-    """The name of an outbox, and the numbers of its last message and of the last acknowledged one."""
+    """The name of an outbox, the number of its newest message, and that of the newest one that the stream has."""
 
     outbox: str
     last: int
@@ -49,7 +49,8 @@ class Head(NamedTuple):
 class Outbox:
     """The outbox in a database; every thread may call it.
 
-    Every method but `wake` raises `StoreError` if the database cannot be used.
+    Methods that open a transaction raise `StoreError` if the database cannot be used. The methods whose names end in
+    `_with` use a transaction of the caller, which raises it.
 
     Parameters
     ----------
@@ -65,7 +66,7 @@ class Outbox:
         self._on_put: Callable[[], None] | None = None
 
     def on_put(self, call: Callable[[], None]) -> None:
-        """Have something called after messages were put, on any thread."""
+        """Register what `wake` calls, on whichever thread calls `wake`."""
         self._on_put = call
 
     def wake(self) -> None:
@@ -80,7 +81,7 @@ class Outbox:
         self.wake()
 
     def put_with(self, connection: Connection, messages: Sequence[Outgoing]) -> None:
-        """Append messages in a transaction that stores what they report; call `wake` after its end."""
+        """Append messages in the caller's transaction, which stores what they report; call `wake` after its end."""
         if not messages:
             return
         head = _head(connection)
@@ -104,6 +105,7 @@ class Outbox:
         Parameters
         ----------
         connection : Connection
+            Of the transaction that stores the events.
         found : sequence of (JsonObject, int)
             Events that the final pass found, each with its start in nanoseconds.
         kept : sequence of (JsonObject, int)
@@ -118,16 +120,17 @@ class Outbox:
     def rename(self) -> None:
         """Give the outbox a new name, under which all messages are sent that wait now.
 
-        A database that was restored from a copy gives numbers again that the hub knows already under the old name. What
-        the hub has of the messages that wait does no harm: it knows events and alerts by their ids.
+        A database that was restored from a backup would reuse numbers that the hub has already received; the new name
+        makes them different. Messages that the hub receives twice do no harm, because it recognises events and alerts
+        by their ids.
         """
-        with self._database.writing("name the outbox of the hub") as connection:
+        with self._database.writing("rename the site's outbox") as connection:
             name = outbox_name(_head(connection).acknowledged + 1)
             connection.execute(update(outbox_head).values(outbox=name))
 
     def head(self) -> Head:
         """Return the name of the outbox, and how far it has come."""
-        with self._database.writing("name the outbox of the hub") as connection:
+        with self._database.writing("read the site's outbox") as connection:
             return _head(connection)
 
     def unsent(self, most: int) -> list[Unsent]:
@@ -145,7 +148,7 @@ class Outbox:
             )
 
     def expire_with(self, connection: Connection, before_ns: int) -> None:
-        """Delete messages about what happened before a time, in the transaction that deletes old events."""
+        """Delete messages whose `time_ns` is earlier than `before_ns`, in the transaction that deletes old events."""
         connection.execute(delete(outbox).where(outbox.c.time_ns < before_ns))
 
 
