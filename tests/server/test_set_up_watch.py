@@ -45,6 +45,7 @@ class Desk:
         self.found: Sequence[Finding] = ()
         self.hidden: tuple[BlindSpot, ...] = ()
         self.examined: list[int] = []
+        self.arrays: list[list[set[str]]] = []
         monkeypatch.setattr(heard_sounds, "observe", lambda received: received)
         monkeypatch.setattr(set_up, "find_set_up_faults", self._find)
         monkeypatch.setattr(set_up, "hidden_by", lambda _site, _sounds: self.hidden)
@@ -62,8 +63,9 @@ class Desk:
         state = self.watch.state
         return list(state.findings), list(state.blind_spots)
 
-    def _find(self, _site: object, sounds: Sequence[object]) -> list[Finding]:
+    def _find(self, _site: object, sounds: Sequence[Sequence[Observation]]) -> list[Finding]:
         self.examined.append(len(sounds))
+        self.arrays.append([{one.array for one in each} for each in sounds])
         return list(self.found)
 
 
@@ -179,6 +181,25 @@ def test_another_run_begins_without_findings(desk: Desk) -> None:
     assert (desk.watch.state.sounds, desk.watch.state.findings, desk.watch.state.errors) == (0, (), {})
     desk.hear([], LEAST_SOUNDS)
     assert desk.watch.state.findings == ()
+
+
+def test_what_an_array_received_before_its_node_restarted_is_not_examined(desk: Desk) -> None:
+    desk.hear([TURNED], KEPT_SOUNDS)
+    desk.watch.take(SOUND)  # and one that is not examined yet
+    desk.watch.forget_arrays({"south"})
+    assert desk.said() == ([], [])
+    desk.hear([])
+    assert desk.arrays[-1] == [{"north"}] * (KEPT_SOUNDS - 1) + [{"north", "south"}]
+    assert len(desk.watch.heard.after(0)) == KEPT_SOUNDS + 2  # calibration may use all
+
+
+def test_what_all_arrays_of_a_site_received_is_forgotten_with_the_sounds(desk: Desk) -> None:
+    desk.hear([TURNED], KEPT_SOUNDS)
+    desk.watch.forget_arrays({"north", "south"})
+    desk.hear([TURNED], LEAST_SOUNDS - 1)
+    assert desk.said() == ([], [])
+    desk.hear([TURNED])
+    assert desk.said() == ([TURNED], [])
 
 
 def test_what_the_site_file_alone_shows_is_there_from_the_beginning(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Final
 
+from livessl import wire
 from livessl.clock import Clock, utc_text
 from livessl.core.stream.array_health import ArrayState, ArrayStatus, NodeReport
 from livessl.core.stream.final_pass import TwoPassFusion
@@ -81,6 +82,7 @@ class ArrayStates:
         self._fusion: TwoPassFusion | None = None
         self._disabled: frozenset[str] = frozenset()  # replaced as a whole, never changed: readers need no lock
         self._switching = threading.Lock()
+        self._runs: dict[str, str] = {}  # of each node, the latest
         self._reported: dict[str, str] = {}
         self._reported_ns = self._watched_ns = 0
         try:
@@ -99,6 +101,12 @@ class ArrayStates:
         self._fusion = fusion
         self._set_up_watch.forget()
         self._ingest.node_reports.forget()
+
+    def join(self, hello: wire.Hello) -> None:
+        """Note that a node has joined; what its arrays received before a restart says nothing about the set-up now."""
+        if self._runs.get(hello.node, hello.run_id) != hello.run_id:
+            self._set_up_watch.forget_arrays(hello.arrays.keys())
+        self._runs[hello.node] = hello.run_id
 
     @property
     def disabled(self) -> frozenset[str]:

@@ -220,6 +220,8 @@ class Engine:
         elif self._site_time.is_replay:
             self._switch(live_run(self._site, self._event_log.begin_live(), self._parallel.for_each))
             self._site_time.begin_live()
+        else:
+            self._array_states.join(hello)
         for array, rate_hz in hello.arrays.items():
             self._rates_hz[array] = rate_hz
             self._run.fusion.prepare(array, rate_hz)

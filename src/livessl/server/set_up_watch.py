@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Final
@@ -71,8 +71,8 @@ class SetUpState:
 class SetUpWatch:
     """Examines the set-up.
 
-    The fusion thread calls `take`, `forget`, `note_reports` and `note_clocks`; every thread may read `state`, which is
-    replaced as a whole.
+    The fusion thread calls `take`, `forget`, `forget_arrays`, `note_reports` and `note_clocks`; every thread may read
+    `state`, which is replaced as a whole.
 
     Parameters
     ----------
@@ -146,6 +146,19 @@ class SetUpWatch:
             if self._clocks_off <= known:
                 return
             self._sounds = [self._on_time(sound) for sound in self._sounds]
+            self._run += 1
+            self._steady = SteadyFindings()
+            self._note(())
+
+    def forget_arrays(self, arrays: Collection[str]) -> None:
+        """Forget what some arrays received, and what was concluded from it: their plugs or poses may be others now.
+
+        The sounds stay available for calibration.
+        """
+        with self._lock:
+            rest = (tuple(one for one in sound if one.array not in arrays) for sound in self._sounds)
+            self._sounds = [sound for sound in rest if sound]
+            self._unjudged, self._examined = 0, self.heard.last
             self._run += 1
             self._steady = SteadyFindings()
             self._note(())
