@@ -7,8 +7,9 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Final
 
-FEW: Final = 4
-"""Up to this many items, waking the second thread costs more than it saves."""
+FEW: Final = 16
+"""Up to this many items, waking the second thread costs more processor time than it saves waiting, most of all on a busy
+machine."""
 
 
 class Parallel:
