@@ -26,17 +26,19 @@ def add_arguments(parser: Any) -> None:
         "--inputs",
         type=argument.positive,
         metavar="N",
-        help="number of inputs (default: all that an interface has; 8 of a sound server or plug-in)",
+        help="number of inputs (default: all of an interface; 8 if the device is a sound server or a plug-in)",
     )
     rate = parser.add_argument(
         "--rate",
         dest="sample_rate",
         type=argument.sample_rate,
         metavar="HZ",
-        help="sampling rate with --device (default: its own)",
+        help="sampling rate in hertz, with --device (default: the device's)",
     )
     add_older_name(parser, "--sample-rate", rate)
-    parser.add_argument("--seconds", type=argument.above_zero, metavar="N", help="end after N s (default: at Ctrl-C)")
+    parser.add_argument(
+        "--seconds", type=argument.above_zero, metavar="N", help="end after N s (default: run until Ctrl-C)"
+    )
     parser.add_argument("--tap", action="store_true", help="report which microphone you tap")
     parser.add_argument(
         "--listen", type=argument.positive, metavar="CH", help="write input CH to a WAV file, to listen to it"

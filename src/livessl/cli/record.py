@@ -28,7 +28,7 @@ def add_arguments(parser: Any) -> None:
         help="format of the recordings: 24-bit FLAC, or WAV with floating-point samples (default: flac)",
     )
     seconds = parser.add_argument(
-        "--seconds", type=argument.above_zero, metavar="N", help="stop after N s (default: at Ctrl-C)"
+        "--seconds", type=argument.above_zero, metavar="N", help="stop after N s (default: run until Ctrl-C)"
     )
     add_older_name(parser, "--duration", seconds)
     add_wav(

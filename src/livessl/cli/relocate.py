@@ -43,7 +43,7 @@ def add_arguments(parser: Any) -> None:
     )
     add_server(
         parser,
-        "the server locates its own stored events again; if the server has tokens, give an operator's. The stored "
+        "the server locates its own stored events again; if the server uses tokens, give an operator's. The stored "
         "events do not change",
     )
     add_method(parser, "the method by which each event was located before")
@@ -61,8 +61,8 @@ def add_arguments(parser: Any) -> None:
         "--out",
         type=Path,
         metavar="FILE",
-        help="write the results to FILE, one JSON object per line; skip events that FILE has located already, and "
-        "try failed ones again, whose lines are replaced",
+        help="write the results to FILE, one JSON object per line; events that FILE already has with a "
+        "result are skipped, and failed ones are tried again",
     )
     add("--jobs", type=argument.positive, help="number of parallel processes (default: one per core)")
     add_json(parser)

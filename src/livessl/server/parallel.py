@@ -8,8 +8,8 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Final
 
 FEW: Final = 16
-"""Up to this many items, waking the second thread costs more processor time than it saves waiting, most of all on a busy
-machine."""
+"""Up to this many items, waking the second thread costs more processor time than it saves waiting, most of all on a
+busy machine."""
 
 
 class Parallel:

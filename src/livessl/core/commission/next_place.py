@@ -20,16 +20,17 @@ STEP_M: Final = 0.5
 """Spacing of the proposed places, metres; places at multiples of it are easy to find with a tape."""
 
 HEIGHTS_M: Final = (0.5, 1.0, 1.5, 2.0)
-"""Heights of the proposed places, metres; all can be reached by hand."""
+"""Heights of the proposed places, metres; all can be reached by hand. A search volume that holds none of them has
+the height of its middle."""
 
 MARGIN_M: Final = 0.5
-"""Least distance of a proposed place from the walls, metres."""
+"""Least distance of a proposed place from the sides of the search volume, metres."""
 
 NEAREST_M: Final = 1.0
 """Least distance of a proposed place from an array, metres; nearer places would have to be measured more exactly."""
 
 APART_M: Final = 0.75
-"""Least distance between two proposed places, metres."""
+"""Least distance of a proposed place from the places of earlier claps, metres."""
 
 _ROUGH_M: Final = 1.0
 _ROUGH_DEG: Final = 60.0
@@ -74,7 +75,7 @@ def proposed_place(
 def expected_stds(
     microphones_m: FloatArray, places_m: FloatArray, c_m_s: float, place_std_m: float
 ) -> tuple[float, float]:
-    """Predict the largest standard deviations, in metres and degrees, of a pose that is measured by claps (S, 3)."""
+    """Predict the largest standard deviations, in metres and degrees, of a pose measured by claps at places (S, 3)."""
     information = _information(microphones_m, places_m, c_m_s, place_std_m).sum(axis=0)
     position_m, orientation_deg = _stds((information + _rough())[None], microphones_m)
     return float(position_m[0]), float(orientation_deg[0])
@@ -102,9 +103,9 @@ def _candidates(microphones: Microphones, places_m: FloatArray, bounds_m: FloatA
 
 
 def _information(microphones_m: FloatArray, places_m: FloatArray, c_m_s: float, place_std_m: float) -> FloatArray:
-    """Return the Fisher information (S, 6, 6) on an array's shift (m) and rotation (rad) of a clap at each place.
+    """Return the Fisher information (S, 6, 6) that a clap at each place gives on an array's shift (m) and turn (rad).
 
-    The place of the clap is a nuisance with its own standard deviation: it adds to the covariance of the delays.
+    The place of a clap is not known exactly; its standard deviation adds to the covariance of the delays.
     """
     towards = places_m[:, None] - microphones_m
     unit = towards / np.maximum(np.linalg.norm(towards, axis=2, keepdims=True), 1e-9)

@@ -24,7 +24,7 @@ GRACE_S: Final = 2.0
 
 @dataclass(slots=True)
 class Received:
-    """All that the clients of a process received about windows that ended in the measured time.
+    """What the clients of a process received: updates of windows that ended in the measured time, and all else.
 
     Parameters
     ----------

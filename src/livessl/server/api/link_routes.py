@@ -18,9 +18,10 @@ from livessl.server.signed_links import LINKABLE, LIVE_PATH
 from livessl.site.alert_models import LIFETIME_S, LinkLifetimeS
 
 LIVE_LIFETIME_S: Final = 600.0
-"""Longest lifetime, in seconds, of a link to the map: who loses access does not go on watching by an old link."""
+"""Longest lifetime, in seconds, of a link to the map: a person who loses access cannot go on watching through an old
+link for longer."""
 
-_NO_TOKENS: Final = "The server uses no tokens, so that no address needs a signature."
+_NO_TOKENS: Final = "The server uses no tokens, so no address needs a signature."
 _log = logging.getLogger(__name__)
 
 

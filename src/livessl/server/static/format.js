@@ -1,4 +1,4 @@
-// Words numbers, times, durations, positions, bearings and latency stages.
+// Words numbers, times (in the browser's time zone), durations, positions, bearings and latency stages.
 
 const MINUS = "\u2212";
 const NARROW_SPACE = "\u202f";
