@@ -7,7 +7,9 @@ from itertools import permutations
 from threading import Thread
 from typing import Any
 
+import orjson
 import pytest
+from sqlalchemy import update
 
 from hall_events import delivered, hall_event
 from history_places import Place as DatabasePlace
@@ -18,6 +20,7 @@ from livessl.federation.schema import SiteEvent
 from livessl.federation.storing import Delivery
 from livessl.server.api.encode import JsonObject
 from livessl.server.history.query import Query
+from livessl.server.history.tables import events
 from small_site import HANG_S
 
 PATIENCE_S = 3.0
@@ -182,6 +185,63 @@ def test_a_message_that_cannot_be_compared_is_left_out_alone(archive: Archive) -
     taken = archive.take([delivered("west", 1, hall_event("w", HERE)), delivered("east", 1, broken)], PATIENCE_S)
     assert ([each.site for each in taken.done], [each.site for each in taken.rejected]) == (["west"], ["east"])
     assert marks(archive) == {"w": (None, [])}
+
+
+def direction(event: str, **changes: Any) -> JsonObject:
+    """An event of the hall with a direction only."""
+    return {**hall_event(event, NEAR, status=Status.DIRECTION_ONLY), **changes}
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"candidates": [{"position_m": [1.0, 2.0]}]},
+        {"candidates": [{"position_m": [1.0, 2.0, 3.0, 4.0]}]},
+        {"candidates": [{"position_m": [1.0, "2", 3.0]}]},
+        {"candidates": [{"position_m": [1.0, 2.0, 1e9]}]},
+        {"candidates": [{}]},
+        {"candidates": "none"},
+        {"contributions": [{"azimuth_deg": 1.0, "elevation_deg": 2.0, "distance_m": 1e200}]},
+        {"contributions": [{"azimuth_deg": 1.0, "elevation_deg": 2.0, "distance_m": -1.0}]},
+        {"contributions": [{"azimuth_deg": 1e9, "elevation_deg": 2.0, "distance_m": 1.0}]},
+        {"contributions": [{"azimuth_deg": 1.0, "elevation_deg": [2.0], "distance_m": 1.0}]},
+        {"contributions": [{"azimuth_deg": 1.0, "distance_m": 1.0}]},
+    ],
+)
+def test_an_event_whose_places_are_not_valid_costs_its_neighbours_nothing(
+    archive: Archive, changes: JsonObject
+) -> None:
+    taken = archive.take([delivered("east", 1, direction("e", **changes))], PATIENCE_S)
+    assert [each.site for each in taken.rejected] == ["east"]
+    take(archive, delivered("west", 1, hall_event("w", HERE)))
+    assert marks(archive) == {"w": (None, [])}
+
+
+def test_further_fields_of_candidates_and_contributions_are_kept(archive: Archive) -> None:
+    candidates = [{"position_m": [2.0, 2, 1.0], "weight": 0.7}]
+    contributions = [{"array": "north", "azimuth_deg": 1.0, "elevation_deg": 0.0, "distance_m": 2, "new": [1]}]
+    take(archive, delivered("east", 1, direction("e", candidates=candidates, contributions=contributions)))
+    [event] = found(archive)
+    assert (event["candidates"], event["contributions"]) == (candidates, contributions)
+
+
+def test_a_covariance_without_bounds_costs_its_neighbours_nothing(archive: Archive) -> None:
+    """It is singular, so that its inverse does not exist, even if a millimetre is added to it."""
+    take(archive, delivered("east", 1, {**hall_event("e", NEAR), "covariance_m2": [[1e12] * 3] * 3}))
+    take(archive, delivered("west", 1, hall_event("w", HERE)))
+    assert set(marks(archive)) == {"e", "w"}
+
+
+def test_an_event_stored_before_that_cannot_be_compared_is_named_and_passed_over(
+    archive: Archive, caplog: pytest.LogCaptureFixture
+) -> None:
+    take(archive, delivered("east", 1, direction("e", candidates=[])))
+    broken = orjson.dumps({**found(archive)[0], "candidates": [{"position_m": [1.0]}]}).decode()
+    with archive.store.database.writing("damage an event") as connection:
+        connection.execute(update(events).values(body=broken))
+    take(archive, delivered("west", 1, hall_event("w", HERE)), delivered("north", 1, hall_event("n", NEAR)))
+    assert (marks(archive)["n"], marks(archive)["w"]) == ((None, [name("west", "w")]), (name("north", "n"), []))
+    assert "event east/e cannot be compared with others" in caplog.text
 
 
 def test_two_hubs_that_store_at_the_same_time_miss_no_copy(place: DatabasePlace) -> None:

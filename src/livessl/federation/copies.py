@@ -14,6 +14,7 @@ from typing import Any, Final, NamedTuple
 
 import orjson
 from sqlalchemy import ColumnElement, Connection, and_, bindparam, delete, insert, or_, select, text, update
+from sqlalchemy.exc import SQLAlchemyError
 
 from livessl.federation.one_sound import SLACK_NS, Name, Sighting, pairs, sighting, sounds
 from livessl.server.api.encode import JsonObject
@@ -88,17 +89,35 @@ def mark_copies(connection: Connection, stored: Iterable[JsonObject]) -> None:
     """
     of_halls = sorted((message for message in stored if message.get("hall")), key=_hall)
     for hall, messages in groupby(of_halls, _hall):
-        connected = _connected(connection, hall, [sighting(message) for message in messages])
-        changed: list[tuple[_Stored, JsonObject]] = []
-        for group in sounds([each.seen for each in connected.values()]):
-            kept, *copies = (connected[seen.name] for seen in group)
-            changed.append((kept, {"copy_of": None, "copies": [_named(copy) for copy in copies]}))
-            changed += [(copy, {"copy_of": _named(kept), "copies": []}) for copy in copies]
+        new = [sighting(message) for message in messages]
+        try:
+            changed = _decided(connection, hall, new)
+        except SQLAlchemyError:
+            raise
+        except Exception:  # whatever another event does to the code, it costs the new ones their marks only
+            names = ", ".join(map(_in_words, sorted(seen.name for seen in new)[:3]))
+            _log.exception("hall %r: the sounds of %d events (%s) are not compared", hall, len(new), names)
+            continue
         _store(connection, [each for each in changed if each[0].message | each[1] != each[0].message])
+
+
+def _decided(connection: Connection, hall: str, new: Sequence[Sighting]) -> list[tuple[_Stored, JsonObject]]:
+    """Return the marks of all events that may be one sound with new ones."""
+    connected = _connected(connection, hall, new)
+    marks: list[tuple[_Stored, JsonObject]] = []
+    for group in sounds([each.seen for each in connected.values()]):
+        kept, *copies = (connected[seen.name] for seen in group)
+        marks.append((kept, {"copy_of": None, "copies": [_named(copy) for copy in copies]}))
+        marks += [(copy, {"copy_of": _named(kept), "copies": []}) for copy in copies]
+    return marks
 
 
 def _hall(message: JsonObject) -> str:
     return str(message["hall"]["name"])
+
+
+def _in_words(name: Name) -> str:
+    return f"{name.site}/{name.id}"
 
 
 def _named(stored: _Stored) -> JsonObject:
@@ -147,7 +166,13 @@ def _overlapping(connection: Connection, hall: str, searched: Iterable[Sighting]
         some = spans[begin : begin + SPANS_AT_ONCE]
         for row in connection.execute(query.where(or_(*map(_is_within, some)))):
             message = orjson.loads(row.body)
-            yield _Stored(row, message, sighting(message))
+            try:
+                seen = sighting(message)
+            except (ValueError, KeyError, TypeError) as error:  # one that a release before this one has stored
+                name = _in_words(Name(message["site"], message["id"]))
+                _log.warning("hall %r: event %s cannot be compared with others: %s", hall, name, error)
+                continue
+            yield _Stored(row, message, seen)
 
 
 def _is_within(span: Span) -> ColumnElement[bool]:

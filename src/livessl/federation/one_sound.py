@@ -44,6 +44,9 @@ arrays detected."""
 ROUNDING_M2: Final = 1e-6
 """Variance, in square metres, that is added to each position: that of a millimetre, as events are rounded."""
 
+ROUNDING: Final = 1e-9
+"""Least variance along any axis as a share of the sum of all three, so that no covariance is singular."""
+
 _RANKS: Final = {Status.LOCATED: 0, Status.DIRECTION_ONLY: 1, Status.REFUSED: 2}
 _REFUSED: Final = _RANKS[Status.REFUSED]
 
@@ -99,9 +102,18 @@ def sighting(event: JsonObject) -> Sighting:
     ----------
     event : JsonObject
         As a hub stores it, with `site` and `hall`.
+
+    Raises
+    ------
+    ValueError, KeyError, TypeError
+        If its places cannot be compared with those of others.
     """
     start_ns = utc_ns(event["time_utc"])
     status, places_m, covariance_m2 = whereabouts(event)
+    if places_m.ndim != 2 or places_m.shape[1] != 3 or covariance_m2.shape != (3, 3):
+        raise ValueError(f"places: expected three coordinates each, got arrays of {places_m.shape}")
+    if not (np.isfinite(places_m).all() and np.isfinite(covariance_m2).all()):
+        raise ValueError("places: expected finite coordinates and variances, got others")
     return Sighting(
         name=Name(event["site"], event["id"]),
         start_ns=start_ns,
@@ -136,7 +148,8 @@ def cost(one: Sighting, other: Sighting) -> float | None:
         shared = len(one.heard_by & other.heard_by) / fewer if fewer else 0.0
         return None if shared < LEAST_SHARED else 1.0 - shared
     first, second = sorted((one, other), key=lambda each: each.name)
-    spread_m2 = first.covariance_m2 + second.covariance_m2 + ROUNDING_M2 * np.eye(3)
+    spread_m2 = first.covariance_m2 + second.covariance_m2
+    spread_m2 = spread_m2 + max(ROUNDING_M2, ROUNDING * float(np.trace(spread_m2))) * np.eye(3)
     apart_m = (first.places_m[:, None] - second.places_m).reshape(-1, 3)
     squared = float(np.einsum("ni,ni->n", apart_m, np.linalg.solve(spread_m2, apart_m.T).T).min())
     return squared + float(np.linalg.slogdet(spread_m2)[1]) if squared <= SAME_PLACE else None

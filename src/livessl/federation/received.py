@@ -23,6 +23,8 @@ def _instant(text: str) -> str:
 Instant = Annotated[str, AfterValidator(_instant)]
 Name = Annotated[str, Field(min_length=1, max_length=200)]
 Coordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
+Position = Annotated[list[Coordinate], Field(min_length=3, max_length=3)]
+Angle = Annotated[float, Field(ge=-360, le=360)]
 Row = Annotated[list[Annotated[float, Field(ge=-1e12, le=1e12)]], Field(min_length=3, max_length=3)]
 
 
@@ -43,13 +45,31 @@ class _Hall(_Message):
     in_tile: bool
 
 
+class _Candidate(_Message):
+    """A place at which the sound of an event may have been."""
+
+    model_config = ConfigDict(strict=True, allow_inf_nan=False, extra="allow")
+
+    position_m: Position
+
+
+class _Contribution(_Message):
+    """What an array contributed to an event; releases differ in which of the fields they send."""
+
+    model_config = ConfigDict(strict=True, allow_inf_nan=False, extra="allow")
+
+    azimuth_deg: Angle | None = None
+    elevation_deg: Angle | None = None
+    distance_m: Annotated[float, Field(ge=0, le=1e6)] | None = None
+
+
 class _Event(_Message):
     """A final event."""
 
     id: Name
     time_utc: Instant
     confidence: Annotated[float, Field(ge=0, le=1)]
-    position_m: Annotated[list[Coordinate], Field(min_length=3, max_length=3)] | None = None
+    position_m: Position | None = None
     status: Name
     method: str | None = None
     reason: str | None = None
@@ -59,6 +79,8 @@ class _Event(_Message):
     heard_by: list[Name] = []
     duration_s: Annotated[float, Field(ge=0, le=1e6)] = 0.0
     covariance_m2: Annotated[list[Row], Field(min_length=3, max_length=3)] | None = None
+    candidates: list[_Candidate] | None = None
+    contributions: list[_Contribution] | None = None
     hall: _Hall | None = None
 
 
