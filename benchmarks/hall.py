@@ -32,6 +32,7 @@ from livessl.clock import SystemClock
 from livessl.core.geometry import rotation
 from livessl.core.types import Event, FloatArray, Status
 from livessl.federation.archive import Archive
+from livessl.federation.halls import Halls
 from livessl.federation.one_sound import Sighting, sighting, sounds
 from livessl.offline import locate
 from livessl.server.api.encode import JsonObject, Messages
@@ -177,7 +178,7 @@ def milliseconds_an_event(count: int, *, in_hall: bool) -> float:
     Each second has a sound at one of ten places, which both servers send; no two are alike.
     """
     with TemporaryDirectory(prefix="livessl-hall-") as folder:
-        archive = Archive(Path(folder) / "hub.sqlite", SystemClock())
+        archive = Archive(Path(folder) / "hub.sqlite", SystemClock(), Halls({"works": tuple(TILES)}))
         deliveries = []
         for number in range(count):
             site, place = number % 2, (number // 2 * 7) % 10

@@ -16,6 +16,7 @@ from history_places import Place as DatabasePlace
 from livessl.clock import SystemClock
 from livessl.core.types import Status
 from livessl.federation.archive import Archive
+from livessl.federation.halls import Halls
 from livessl.federation.schema import SiteEvent
 from livessl.federation.storing import Delivery
 from livessl.server.api.encode import JsonObject
@@ -24,13 +25,14 @@ from livessl.server.history.tables import events
 from small_site import HANG_S
 
 PATIENCE_S = 3.0
+HALLS = Halls({"works": ("west", "east", "north", "a", "b", "c", "d"), "other": ("east",)})
 HERE, NEAR, FAR = (2.0, 2.0, 1.0), (2.1, 2.0, 1.0), (3.5, 4.0, 1.0)
 
 
 @pytest.fixture
 def archive(place: DatabasePlace) -> Iterator[Archive]:
     assert place is not None
-    made = Archive(place, SystemClock())
+    made = Archive(place, SystemClock(), HALLS)
     yield made
     made.close()
 
@@ -187,6 +189,26 @@ def test_a_message_that_cannot_be_compared_is_left_out_alone(archive: Archive) -
     assert marks(archive) == {"w": (None, [])}
 
 
+@pytest.mark.parametrize(("site", "hall"), [("guest", "works"), ("west", "other"), ("west", "unheard-of")])
+def test_a_site_that_a_hall_does_not_list_hides_no_event_there(
+    place: DatabasePlace, caplog: pytest.LogCaptureFixture, site: str, hall: str
+) -> None:
+    assert place is not None
+    archive = Archive(place, SystemClock(), Halls({"works": ("east", "west"), "other": ("east",)}))
+    take(archive, delivered("east", 1, hall_event("e", HERE, hall=hall, in_tile=False)))
+    for number in (1, 2):
+        sharp = hall_event(f"g{number}", NEAR, hall=hall, std_m=0.01)
+        take(archive, delivered(site, number, sharp))
+    assert shown(archive) == ["e", "g1", "g2"]
+    assert [event["hall"] for event in found(archive)[1:]] == [None, None]
+    for event in found(archive):
+        SiteEvent.model_validate(event)
+    warned = [record.getMessage() for record in caplog.records if f"site {site!r}" in record.getMessage()]
+    assert (len(warned), f"halls: {{{hall}: [" in warned[0]) == (1, True)
+    assert archive.halls.ignored >= 2
+    archive.close()
+
+
 def direction(event: str, **changes: Any) -> JsonObject:
     """An event of the hall with a direction only."""
     return {**hall_event(event, NEAR, status=Status.DIRECTION_ONLY), **changes}
@@ -248,7 +270,7 @@ def test_two_hubs_that_store_at_the_same_time_miss_no_copy(place: DatabasePlace)
     """As for a moment when one hub takes over from another that has lost its connection."""
     assert place is not None
     count = 40
-    hubs = {site: Archive(place, SystemClock()) for site in ("west", "east")}
+    hubs = {site: Archive(place, SystemClock(), HALLS) for site in ("west", "east")}
 
     def store(site: str) -> None:
         for number in range(count):

@@ -26,6 +26,7 @@ from small_site import HANG_S, running_server, wait_until
 pytestmark = pytest.mark.usefixtures("nothing_is_shed")
 
 CLOCK = SystemClock()
+HALLS = {"works": list(TILES)}
 DEEP_WEST, DEEP_EAST = (2.5, 3.5, 1.2), (9.3, 2.2, 1.3)
 AT_BORDER, NEAR_BORDER = (6.1, 3.1, 1.1), (5.6, 1.2, 1.5)
 TOGETHER = (1.8, 4.0, 1.2), (10.0, 2.0, 1.3)
@@ -81,7 +82,7 @@ def nats(tmp_path_factory: pytest.TempPathFactory) -> Iterator[NatsServer]:
 
 def test_each_sound_of_a_hall_on_two_servers_is_shown_once(nats: NatsServer, tmp_path: Path) -> None:
     with ExitStack() as stack:
-        hub = stack.enter_context(running_hub(make_hub("hub.sqlite", [nats.url], tmp_path)))
+        hub = stack.enter_context(running_hub(make_hub("hub.sqlite", [nats.url], tmp_path, halls=HALLS)))
         sites = {name: hall_site(name, [nats.url], tmp_path) for name in TILES}
         servers = {name: stack.enter_context(running_server(site)) for name, site in sites.items()}
         with nodes({name: server.endpoint for name, server in servers.items()}, SOUNDS):
@@ -113,7 +114,7 @@ def test_events_of_a_server_that_was_away_become_copies_when_they_come(tmp_path:
     late = free_endpoint()
     sounds = ((0.7, AT_BORDER), (2.5, DEEP_EAST), (4.5, DEEP_WEST), (25.0, DEEP_WEST))
     with running_nats(folder / "nats") as nats, ExitStack() as stack:
-        settings = make_hub("hub.sqlite", [nats.url], folder)
+        settings = make_hub("hub.sqlite", [nats.url], folder, halls=HALLS)
         west = stack.enter_context(running_server(hall_site("west", [nats.url], folder)))
         with nodes({"west": west.endpoint, "east": late}, sounds):
             with running_hub(settings) as hub:

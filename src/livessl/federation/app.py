@@ -17,6 +17,7 @@ from livessl import __version__
 from livessl.clock import Clock
 from livessl.federation.archive import Archive
 from livessl.federation.config import Hub
+from livessl.federation.halls import Halls
 from livessl.federation.intake import Intake
 from livessl.federation.metrics import metrics_route
 from livessl.federation.routes import hub_routes
@@ -120,7 +121,7 @@ class HubServer:
         with ExitStack() as undo:  # closes what is open if a later step fails
             self._listener = listen(http.host, http.port)
             undo.callback(self._listener.close)
-            self.archive = Archive(hub.database, clock)
+            self.archive = Archive(hub.database, clock, Halls(hub.settings.halls))
             """The database, which other hubs may share."""
             undo.callback(self.archive.close)
             self.intake = Intake(hub, self.archive, clock)

@@ -18,6 +18,7 @@ from sqlalchemy import Connection, bindparam, case, delete, insert, select, text
 
 from livessl.clock import Clock, utc_ns
 from livessl.federation.gaps import Gaps
+from livessl.federation.halls import Halls
 from livessl.federation.overview import Contact, describe
 from livessl.federation.storing import Delivery, Taken, put, read
 from livessl.server.api.encode import JsonObject
@@ -60,14 +61,17 @@ class Archive:
     place : Path or str
         SQLite file, or URL of a PostgreSQL database.
     clock : Clock
+    halls : Halls or None
+        Decides which sites are in which hall; None for no halls.
     """
 
-    def __init__(self, place: Path | str, clock: Clock) -> None:
+    def __init__(self, place: Path | str, clock: Clock, halls: Halls | None = None) -> None:
         self.store = Store(place, forwards=True)
         """The history of events; the id of an event is `SITE/ID` there."""
         self._database = self.store.database
         self._clock = clock
         self._gaps = Gaps()
+        self.halls = Halls({}) if halls is None else halls
 
     def expire(self, before_ns: int, end: threading.Event | None = None) -> int:
         """Delete events and alerts from before a time; return the number of events."""
@@ -131,7 +135,7 @@ class Archive:
                 if gap > 0 and self._gaps.seen_s(key, last[key], now_ns) < patience_s:
                     taken.early.append(delivery)
                     continue
-                message = read(delivery)
+                message = read(delivery, self.halls)
                 if message is None:
                     taken.rejected.append(delivery)
                 else:

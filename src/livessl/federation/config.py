@@ -14,7 +14,7 @@ from livessl.site.addresses import is_loopback
 from livessl.site.fields import Model, Positive
 from livessl.site.findings import Locator, duplicate_keys, nodes_of, reason, validation_findings, value_of
 from livessl.site.history_place import check_history_place, is_url
-from livessl.site.hub_models import NatsConfig
+from livessl.site.hub_models import HallName, NatsConfig
 from livessl.site.server_models import HttpConfig
 
 
@@ -22,6 +22,9 @@ def _place(name: str) -> str:
     checked = check_history_place(name)
     assert checked is not None
     return checked
+
+
+SiteName = Annotated[str, Field(min_length=1, max_length=200)]
 
 
 class StreamConfig(Model):
@@ -39,7 +42,7 @@ class HubHttpConfig(HttpConfig):
 
 
 class HubFile(Model):
-    """The hub's file."""
+    """The hub's file; `halls` lists the sites of each hall, whose events are compared with each other."""
 
     hub: Annotated[str, Field(min_length=1, max_length=64)] = "hub"
     nats: NatsConfig
@@ -47,6 +50,7 @@ class HubFile(Model):
     database: Annotated[str, AfterValidator(_place)]
     http: HubHttpConfig = HubHttpConfig()
     retention_days: Positive | None = None
+    halls: dict[HallName, Annotated[tuple[SiteName, ...], Field(min_length=1)]] = Field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)

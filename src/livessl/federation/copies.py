@@ -94,7 +94,7 @@ def mark_copies(connection: Connection, stored: Iterable[JsonObject]) -> None:
             changed = _decided(connection, hall, new)
         except SQLAlchemyError:
             raise
-        except Exception:  # whatever another event does to the code, it costs the new ones their marks only
+        except Exception:  # noqa: BLE001 - whatever another event does to the code, it costs the new ones their marks only
             names = ", ".join(map(_in_words, sorted(seen.name for seen in new)[:3]))
             _log.exception("hall %r: the sounds of %d events (%s) are not compared", hall, len(new), names)
             continue

@@ -291,7 +291,7 @@ class Intake:
             _log.error("%s: a report is left out: %s", message.subject, " ".join(str(error).split()))
             return
         if site is not None:
-            self._reports[site[0]] = report
+            self._reports[site[0]] = self._archive.halls.admitted(site[0], report)
 
     async def _store_reports(self) -> None:
         """Store the reports that have come, all of a second at once, until cancelled.

@@ -50,6 +50,8 @@ class _Metrics(Collector):
         yield GaugeMetricFamily("livessl_hub_takes_in", "1 while this hub takes messages in.", float(intake.has_turn))
         yield CounterMetricFamily("livessl_hub_taken", "Messages taken in.", intake.taken)
         yield CounterMetricFamily("livessl_hub_rejected", "Messages that could not be stored.", intake.rejected)
+        ignored = self._archive.halls.ignored
+        yield CounterMetricFamily("livessl_hub_halls_ignored", "Messages whose hall does not list their site.", ignored)
         yield from site_metrics(self._archive.contacts())
 
 

@@ -11,6 +11,7 @@ from sqlalchemy import Connection, Table, bindparam, delete, insert, select
 
 from livessl.clock import utc_ns
 from livessl.federation.copies import as_stored, hall_tags, lock_halls, mark_copies
+from livessl.federation.halls import Halls
 from livessl.federation.received import RECEIVED
 from livessl.server.api.encode import JsonObject
 from livessl.server.forwarding.stream import Place
@@ -48,8 +49,10 @@ class Taken(NamedTuple):
     rejected: list[Delivery]
 
 
-def read(delivery: Delivery) -> JsonObject | None:
+def read(delivery: Delivery, halls: Halls) -> JsonObject | None:
     """Return a message as it is stored: its checked fields, further ones as they are, and its site.
+
+    Its hall is left out if its site is not in that.
 
     None if it is not what its kind has to be.
     """
@@ -60,7 +63,8 @@ def read(delivery: Delivery) -> JsonObject | None:
         what = " ".join(str(error).split())
         _log.error("site %r: message %d is left out: %s", delivery.site, delivery.place.number, what)
         return None
-    return {**message, **checked.model_dump(exclude_unset=True), "site": delivery.site}
+    made = {**message, **checked.model_dump(exclude_unset=True), "site": delivery.site}
+    return halls.admitted(delivery.site, made) if delivery.kind == "event" else made
 
 
 def put(connection: Connection, batch: Sequence[tuple[str, str, JsonObject]]) -> None:

@@ -36,6 +36,9 @@ def _server(url: str) -> str:
 Server = Annotated[str, AfterValidator(_server)]
 
 
+HallName = Annotated[str, Field(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9._-]+$")]
+
+
 class NatsConfig(Model):
     """Addresses of NATS servers, and what this program identifies itself with."""
 
@@ -64,7 +67,7 @@ class HallConfig(Model):
     All servers of a hall use the coordinates of the hall.
     """
 
-    name: Annotated[str, Field(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9._-]+$")]
+    name: HallName
     tile_m: tuple[tuple[Coordinate, Coordinate], ...]
 
     @field_validator("tile_m")
