@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -189,6 +190,21 @@ def test_what_a_server_missed_waits_in_its_own_folder_for_the_next_run_of_the_no
     ]
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="127.0.0.2 is an address of this machine on Linux only")
+@pytest.mark.parametrize("further", [{}, {"arrays": ["north"]}])
+def test_of_two_addresses_of_one_server_one_delivers_and_the_other_is_refused_in_words(
+    tmp_path: Path, further: dict[str, object]
+) -> None:
+    with server("tcp://0.0.0.0:*") as one:
+        port = one.receiver.endpoint.rpartition(":")[2]
+        site = node_site(f"tcp://127.0.0.1:{port}", f"tcp://127.0.0.2:{port}", tmp_path, **further)
+        with pytest.raises(UndeliveredError, match="a node named 'lab-pc' is connected already; names must differ"):
+            capture(site, "run-1")
+        one.wait_for_the_good_bye()
+        frames = one.frames("north")
+        assert len(frames) == len(set(frames)) == 18
+
+
 def test_frames_for_a_server_that_is_no_longer_named_are_reported(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -204,6 +220,10 @@ def test_frames_for_a_server_that_is_no_longer_named_are_reported(
     ("further", "wanted"),
     [
         ({"server": "tcp://127.0.0.1:5570"}, r"further_servers\[?.?0.*server.*expected each server once"),
+        ({"server": "tcp://localhost:5570"}, r"got 'tcp://localhost:5570' which is 'tcp://127.0.0.1:5570' again"),
+        ({"server": "tcp://LocalHost:5570"}, r"expected each server once"),
+        ({"server": "tcp://[::1]:5570"}, r"expected each server once"),
+        ({"server": "tcp://[::ffff:127.0.0.1]:5570"}, r"expected each server once"),
         ({"server": "tcp://127.0.0.1:5571", "arrays": ["noth"]}, r"expected arrays of this node, north, south, got"),
         ({"server": "tcp://127.0.0.1:5571", "public_key": "b.public"}, r"expected keys as well"),
         ({"server": "127.0.0.1"}, r"tcp://"),

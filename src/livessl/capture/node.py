@@ -212,12 +212,14 @@ def _links(site: Site, name: str, pipelines: Sequence[Pipeline], clock: Clock, r
     config, encode = site.nodes[name], EncodeOnce()
     hello, keys = _hello(name, pipelines, run_id), node_keys(site, name)
     links = [_link(config.server, hello, keys, pipelines, clock, _spool(site, name, name, encode))]
-    for further in config.further_servers:
+    for number, further in enumerate(config.further_servers, 2):
+        # each link is a run of its own: if two addresses are those of one server, it refuses the second link in words
+        own = replace(hello, run_id=f"{run_id}-{number}")
         wanted = set(config.arrays if further.arrays is None else further.arrays)
         # a joint array is sent for any of its members
         rates = {each: rate for each, rate in hello.arrays.items() if not wanted.isdisjoint(site.members(each))}
         keys, spool = node_keys(site, name, further.public_key), _spool(site, name, _folder(name, further), encode)
-        links.append(_link(further.server, replace(hello, arrays=rates), keys, pipelines, clock, spool))
+        links.append(_link(further.server, replace(own, arrays=rates), keys, pipelines, clock, spool))
     _warn_of_abandoned_spools(site, name)
     return Links(links)
 

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import re
 from ipaddress import AddressValueError, IPv6Address, ip_address, ip_network
+from typing import Final
+
+LOOPBACK: Final = ("127.0.0.1", "localhost", "::1")
+"""Names of this machine by which a node reaches the same server."""
 
 
 def check_endpoint(endpoint: str, *, wildcards: bool = False) -> str:
@@ -125,6 +129,16 @@ def needs_ipv6(endpoint: str) -> bool:
     For other endpoints it must stay off: ZeroMQ would then use nothing but the IPv6 address of a name that has both.
     """
     return endpoint.startswith("tcp://[")
+
+
+def same_on_loopback(endpoint: str) -> str:
+    """Return a ZeroMQ address in one spelling: in lower case, and with 127.0.0.1 for its aliases on this machine."""
+    scheme, _, rest = endpoint.partition("://")
+    if scheme != "tcp":
+        return endpoint
+    host, _, port = rest.lower().rpartition(":")
+    bare = plain_address(host.strip("[]"))
+    return f"tcp://{'127.0.0.1' if bare in LOOPBACK else bare}:{port}"
 
 
 def in_url(host: str) -> str:

@@ -9,6 +9,7 @@ import numpy as np
 
 from livessl.core.types import ArraySpec
 from livessl.site import polygon
+from livessl.site.addresses import same_on_loopback
 from livessl.site.hub_models import HallConfig
 from livessl.site.models import Site
 from livessl.site.place import Finding, Place
@@ -42,8 +43,11 @@ def hall_faults(site: Site) -> Iterator[Finding]:
     for name, node in site.nodes.items():
         for number, further in enumerate(node.further_servers):
             here: Place = ("nodes", name, "further_servers", number)
-            if further.server in node.endpoints[: number + 1]:
-                yield (*here, "server"), f"expected each server once, got {further.server!r} again; remove it"
+            known = {same_on_loopback(endpoint): endpoint for endpoint in node.endpoints[: number + 1]}
+            same = known.get(same_on_loopback(further.server))
+            if same is not None:
+                again = "again" if same == further.server else f"which is {same!r} again"
+                yield (*here, "server"), f"expected each server once, got {further.server!r} {again}; remove it"
             if further.public_key is not None and site.keys is None:
                 yield (
                     (*here, "public_key"),
