@@ -16,6 +16,7 @@ from history_places import Place as DatabasePlace
 from livessl.clock import SystemClock
 from livessl.core.types import Status
 from livessl.federation.archive import Archive
+from livessl.federation.copies import MOST_TOGETHER
 from livessl.federation.halls import Halls
 from livessl.federation.schema import SiteEvent
 from livessl.federation.storing import Delivery
@@ -207,6 +208,28 @@ def test_a_site_that_a_hall_does_not_list_hides_no_event_there(
     assert (len(warned), f"halls: {{{hall}: [" in warned[0]) == (1, True)
     assert archive.halls.ignored >= 2
     archive.close()
+
+
+@pytest.mark.parametrize("together", [1, 40])
+def test_an_endless_chain_of_events_is_marked_in_bounds_and_logged_once(
+    archive: Archive, caplog: pytest.LogCaptureFixture, together: int
+) -> None:
+    """Events of two servers in turns, each of which overlaps with the one before and the one after it."""
+    archive.halls = Halls({"works": ("west", "east")})
+    count = 2 * MOST_TOGETHER + 40
+    chain = [
+        ({0: "west", 1: "east"}[k % 2], {**hall_event(f"c{k:03d}", HERE, at_s=0.5 * k), "duration_s": 1.0})
+        for k in range(count)
+    ]
+    deliveries = list(in_order(chain))
+    for first in range(0, count, together):
+        take(archive, *deliveries[first : first + together])
+    found_marks = marks(archive)
+    for event, (copy_of, copies) in found_marks.items():  # each mark has its other, and no event is shown twice
+        assert all(found_marks[copy["id"]][0]["id"] == event for copy in copies)
+        assert copy_of is None or [copy["id"] for copy in found_marks[copy_of["id"]][1]] == [event]
+    assert len(shown(archive)) <= count // 2 + 5
+    assert len([record for record in caplog.records if "overlap in turns" in record.getMessage()]) == 1
 
 
 def direction(event: str, **changes: Any) -> JsonObject:

@@ -143,7 +143,7 @@ class Archive:
                     taken.done.append(delivery)
                 missing[delivery.site] = missing.get(delivery.site, 0) + gap
                 last[key] = delivery.place.number
-            put(connection, batch)
+            put(connection, batch, self.halls)
             raised = [{"of_site": site, "of_outbox": box, "number": number} for (site, box), number in last.items()]
             connection.execute(_RAISE, raised)
             newest: dict[str, int] = {}

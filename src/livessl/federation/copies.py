@@ -8,7 +8,7 @@ the events of a hall that overlap with a new one; those that come at once after 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import groupby
 from typing import Any, Final, NamedTuple
 
@@ -16,6 +16,7 @@ import orjson
 from sqlalchemy import ColumnElement, Connection, and_, bindparam, delete, insert, or_, select, text, update
 from sqlalchemy.exc import SQLAlchemyError
 
+from livessl.federation.halls import Halls
 from livessl.federation.one_sound import SLACK_NS, Name, Sighting, pairs, sighting, sounds
 from livessl.server.api.encode import JsonObject
 from livessl.server.history.tables import COPY, events, tags
@@ -26,9 +27,9 @@ LOCK: Final = 0x11_7E_55_3
 LONGEST_NS: Final = 60_000_000_000
 """Longest event, in nanoseconds, that a site file allows. A longer one may not be found by one that ends before it."""
 
-MOST_TOGETHER: Final = 1000
-"""Most events that are compared with each other to place a new one. Sounds that follow each other without a pause, and
-overlap at two servers in turns, could connect any number."""
+MOST_TOGETHER: Final = 100
+"""Number of connected events from which on no further ones are searched to place a new one. Sounds that follow each
+other without a pause, and overlap at two servers in turns, could connect any number."""
 
 SPANS_AT_ONCE: Final = 100
 """Spans of time that one statement asks for."""
@@ -77,7 +78,7 @@ def lock_halls(connection: Connection) -> None:
         connection.execute(text("SELECT pg_advisory_xact_lock(:number)"), {"number": LOCK})
 
 
-def mark_copies(connection: Connection, stored: Iterable[JsonObject]) -> None:
+def mark_copies(connection: Connection, stored: Iterable[JsonObject], halls: Halls) -> None:
     """Decide anew about the sounds that new events belong to; call `lock_halls` before these are stored.
 
     Parameters
@@ -86,12 +87,14 @@ def mark_copies(connection: Connection, stored: Iterable[JsonObject]) -> None:
         Its transaction has stored the events.
     stored : iterable of JsonObject
         The new events; those of no hall are left alone.
+    halls : Halls
+        Notes a hall in which too many events are connected.
     """
     of_halls = sorted((message for message in stored if message.get("hall")), key=_hall)
     for hall, messages in groupby(of_halls, _hall):
         new = [sighting(message) for message in messages]
         try:
-            changed = _decided(connection, hall, new)
+            changed = _decided(connection, hall, new, halls)
         except SQLAlchemyError:
             raise
         except Exception:  # noqa: BLE001 - whatever another event does to the code, it costs the new ones their marks only
@@ -101,9 +104,14 @@ def mark_copies(connection: Connection, stored: Iterable[JsonObject]) -> None:
         _store(connection, [each for each in changed if each[0].message | each[1] != each[0].message])
 
 
-def _decided(connection: Connection, hall: str, new: Sequence[Sighting]) -> list[tuple[_Stored, JsonObject]]:
+def _decided(
+    connection: Connection, hall: str, new: Sequence[Sighting], halls: Halls
+) -> list[tuple[_Stored, JsonObject]]:
     """Return the marks of all events that may be one sound with new ones."""
-    connected = _connected(connection, hall, new)
+    connected, is_whole = _connected(connection, hall, new)
+    if not is_whole:
+        halls.note_crowd(hall, len(connected))
+        connected = _unbound(connected)
     marks: list[tuple[_Stored, JsonObject]] = []
     for group in sounds([each.seen for each in connected.values()]):
         kept, *copies = (connected[seen.name] for seen in group)
@@ -124,36 +132,61 @@ def _named(stored: _Stored) -> JsonObject:
     return stored.seen.name._asdict()
 
 
-def _connected(connection: Connection, hall: str, new: Sequence[Sighting]) -> dict[Name, _Stored]:
-    """Return the new events, and all that may be one sound with them, or with one of those, and so on."""
+def _connected(connection: Connection, hall: str, new: Sequence[Sighting]) -> tuple[dict[Name, _Stored], bool]:
+    """Return the new events, and all that may be one sound with them, or with one of those, and so on.
+
+    False if there are more: from `MOST_TOGETHER` connected events on, no further ones are searched.
+    """
     known: dict[Name, _Stored] = {}
-    linked = {seen.name for seen in new}
+    partners: dict[Name, list[Name]] = {}
+    asked = {seen.name for seen in new}
     searched: Iterable[Sighting] = new
     while True:
-        for stored in _overlapping(connection, hall, searched):
-            known[stored.seen.name] = stored
-        further = _component([stored.seen for stored in known.values()], linked) - linked
+        found = _overlapping(connection, hall, searched)
+        fresh = {stored.seen.name: stored for stored in found if stored.seen.name not in known}
+        known |= fresh
+        for one, other, _ in pairs([stored.seen for stored in known.values()], fresh.keys()):
+            partners.setdefault(one.name, []).append(other.name)
+            partners.setdefault(other.name, []).append(one.name)
+        groups = _components(partners, [seen.name for seen in new])
+        further = {name for group in groups if len(group) <= MOST_TOGETHER for name in group} - asked
         if not further:
-            return {name: known[name] for name in linked}
-        linked |= further
-        if len(linked) > MOST_TOGETHER:
-            _log.warning("hall %r: %d events may be one sound in turns; later ones are not compared", hall, len(linked))
-            return {name: known[name] for name in linked}
+            linked = set().union(*groups)
+            return {name: known[name] for name in linked}, linked <= asked
+        asked |= further
         searched = [known[name].seen for name in further]
 
 
-def _component(seen: Sequence[Sighting], names: Set[Name]) -> set[Name]:
-    """Return the names of the events that pairs connect with some of them."""
-    partners: dict[Name, list[Name]] = {}
-    for one, other, _ in pairs(seen):
-        partners.setdefault(one.name, []).append(other.name)
-        partners.setdefault(other.name, []).append(one.name)
-    found, waiting = set(names), list(names)
-    while waiting:
-        fresh = set(partners.get(waiting.pop(), ())) - found
-        found |= fresh
-        waiting += fresh
-    return found
+def _components(partners: Mapping[Name, Sequence[Name]], names: Iterable[Name]) -> list[set[Name]]:
+    """Return the connected events of each of some events, each once."""
+    groups: list[set[Name]] = []
+    seen: set[Name] = set()
+    for name in names:
+        if name in seen:
+            continue
+        group, waiting = {name}, [name]
+        while waiting:
+            fresh = set(partners.get(waiting.pop(), ())) - group
+            group |= fresh
+            waiting += fresh
+        groups.append(group)
+        seen |= group
+    return groups
+
+
+def _unbound(connected: Mapping[Name, _Stored]) -> dict[Name, _Stored]:
+    """Return those events that are marked together with none that is missing here, so that no mark loses its other."""
+    free = dict(connected)
+    while bound := [name for name, stored in free.items() if not _marked_with(stored) <= free.keys()]:
+        for name in bound:
+            del free[name]
+    return free
+
+
+def _marked_with(stored: _Stored) -> set[Name]:
+    """Return the events that an event's marks name."""
+    others = [*stored.message.get("copies", ()), stored.message.get("copy_of")]
+    return {Name(other["site"], other["id"]) for other in others if other is not None}
 
 
 def _overlapping(connection: Connection, hall: str, searched: Iterable[Sighting]) -> Iterator[_Stored]:

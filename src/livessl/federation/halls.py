@@ -27,9 +27,23 @@ class Halls:
     def __init__(self, sites: Mapping[str, Collection[str]]) -> None:
         self._sites = {hall: frozenset(names) for hall, names in sites.items()}
         self._noted: set[tuple[str, str]] = set()
+        self._crowded: set[str] = set()
         self._lock = threading.Lock()
         self.ignored = 0
         """Messages since the start whose hall was ignored."""
+
+    def note_crowd(self, hall: str, count: int) -> None:
+        """Log once for each hall that more events are connected than are compared."""
+        with self._lock:
+            is_news = hall not in self._crowded
+            self._crowded.add(hall)
+        if is_news:
+            _log.warning(
+                "hall %r: %d or more events overlap in turns and may be one sound; the earliest marks of such a chain "
+                "stay as they are (logged once)",
+                hall,
+                count,
+            )
 
     def admitted(self, site: str, message: JsonObject) -> JsonObject:
         """Return a message or a report of a site, without its hall if the site is not in that.

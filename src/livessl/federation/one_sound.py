@@ -14,7 +14,7 @@ The decision depends on the events alone, whatever the order in which they are g
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence, Set
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
@@ -155,12 +155,14 @@ def cost(one: Sighting, other: Sighting) -> float | None:
     return squared + float(np.linalg.slogdet(spread_m2)[1]) if squared <= SAME_PLACE else None
 
 
-def pairs(events: Iterable[Sighting]) -> Iterator[tuple[Sighting, Sighting, float]]:
-    """Yield each two events that may be one sound, and their cost."""
+def pairs(events: Iterable[Sighting], new: Set[Name] | None = None) -> Iterator[tuple[Sighting, Sighting, float]]:
+    """Yield each two events that may be one sound, and their cost; with `new` only pairs with at least one of those."""
     sounding: list[Sighting] = []
     for event in sorted(events, key=lambda each: (each.start_ns, each.name)):
         sounding = [other for other in sounding if other.end_ns + SLACK_NS >= event.start_ns]
         for other in sounding:
+            if new is not None and event.name not in new and other.name not in new:
+                continue
             found = cost(event, other)
             if found is not None:
                 yield event, other, found

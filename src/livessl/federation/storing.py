@@ -67,7 +67,7 @@ def read(delivery: Delivery, halls: Halls) -> JsonObject | None:
     return halls.admitted(delivery.site, made) if delivery.kind == "event" else made
 
 
-def put(connection: Connection, batch: Sequence[tuple[str, str, JsonObject]]) -> None:
+def put(connection: Connection, batch: Sequence[tuple[str, str, JsonObject]], halls: Halls) -> None:
     """Store messages with the outcome that they have one by one in their order, by a few statements for all of them."""
     by_kind: dict[str, list[JsonObject]] = {"event": [], "alert": []}
     tracks_now, arrays_now = _States(tracks, "id"), _States(arrays, "name")
@@ -82,7 +82,7 @@ def put(connection: Connection, batch: Sequence[tuple[str, str, JsonObject]]) ->
                 arrays_now.change(site, message)
             case _:
                 by_kind[kind].append(message)
-    _put_events(connection, by_kind["event"])
+    _put_events(connection, by_kind["event"], halls)
     _put_alerts(connection, by_kind["alert"])
     tracks_now.store(connection)
     arrays_now.store(connection)
@@ -131,7 +131,7 @@ class _States:
             connection.execute(insert(self._table), rows)
 
 
-def _put_events(connection: Connection, messages: Sequence[JsonObject]) -> None:
+def _put_events(connection: Connection, messages: Sequence[JsonObject], halls: Halls) -> None:
     """Store the events that are not known yet, with the rows by which they are found."""
     if not messages:
         return
@@ -159,7 +159,7 @@ def _put_events(connection: Connection, messages: Sequence[JsonObject]) -> None:
         tags.append({"kind": "site", "name": message["site"], "number": number, **compared})
         tags += hall_tags(message, {"number": number, **compared})
     connection.execute(insert(history.tags), tags)
-    mark_copies(connection, [known_as[key] for key in rows])
+    mark_copies(connection, [known_as[key] for key in rows], halls)
 
 
 def _put_alerts(connection: Connection, messages: Sequence[JsonObject]) -> None:
