@@ -45,6 +45,23 @@ def test_requested_frames_are_sent_and_not_kept() -> None:
         link.close(bye=False)
 
 
+def test_frames_of_arrays_that_a_server_does_not_get_are_not_sent_on_request() -> None:
+    asked: list[str] = []
+
+    def backfill(request: BackfillRequest) -> list[Message]:
+        asked.append(request.array)
+        return remembered(request)
+
+    with Router() as router:
+        link = Link(router.endpoint, replace(HELLO, arrays={"south": 16000.0}), SystemClock(), backfill=backfill)
+        connect(link, router)
+        router.send(wire.encode(wire.Request("run-1", {"north": (40, 42), "west": (1, 9), "south": (70, 72)})))
+        together(link, router, lambda: len(sounds(router)) == 2, "the answer")
+        assert {m.array for m in sounds(router)} == {"south"}
+        link.close(bye=False)
+    assert asked == ["south"]
+
+
 def test_another_server_is_not_assumed_to_know_requests() -> None:
     clock = HandClock()
     with Router() as router:

@@ -218,7 +218,8 @@ class Link:
             self._hello = replace(self._hello, answers=True)
             self._say_hello()
         for array, (first, last) in request.wanted.items():
-            self._outbox.add_requested(self._backfill(BackfillRequest(array, first, last - 1)))
+            if array in self._hello.arrays:  # the node has others, which this server does not get
+                self._outbox.add_requested(self._backfill(BackfillRequest(array, first, last - 1)))
 
     def _acknowledge(self, ack: wire.Ack) -> None:
         if ack.who_are_you:
