@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from itertools import permutations
+from itertools import combinations, permutations
 
 import numpy as np
 import pytest
@@ -101,11 +101,28 @@ def test_a_vague_event_does_not_take_the_partner_of_a_sharp_one() -> None:
     assert named(sounds(events)) == [["a"], ["a1", "b"]]
 
 
-def test_a_sound_at_a_corner_is_one_though_two_of_three_servers_just_disagree() -> None:
-    third = 1.9 * limit_m() / 2.0
-    corner = [seen("a"), seen("b", third), seen("c", 2.0 * third)]
-    assert cost(corner[0], corner[2]) is None
-    assert named(sounds(corner)) == [["a", "b", "c"]]
+def test_an_uncertain_event_does_not_join_two_sounds_at_different_places() -> None:
+    """It agrees with both of them, and joins the nearer one."""
+    sharp = [seen("a"), seen("c", 1.5)]
+    assert cost(*sharp) is None
+    for x_m, wanted in ((0.7, [["a", "b"], ["c"]]), (0.8, [["a"], ["c", "b"]])):
+        vague = seen("b", x_m, std_m=0.4)
+        assert None not in [cost(vague, each) for each in sharp]
+        assert named(sounds([*sharp, vague])) == wanted
+
+
+def test_a_direction_or_a_refusal_joins_no_two_sounds_either() -> None:
+    for rank in (DIRECTION, REFUSED):
+        unsure = seen("b", 0.75, std_m=5.0, rank=rank, heard_by="x")
+        groups = named(sounds([seen("a", heard_by="x"), seen("c", 1.5, heard_by="x"), unsure]))
+        assert sorted(len(group) for group in groups) == [1, 2]
+
+
+@given(st.deferred(lambda: crowds()))
+def test_all_located_events_of_a_sound_agree_with_each_other(events: list[Sighting]) -> None:
+    for group in sounds(events):
+        located = [event for event in group if event.rank == LOCATED]
+        assert all(cost(one, other) is not None for one, other in combinations(located, 2))
 
 
 def test_four_servers_at_a_corner_find_two_sounds_each() -> None:

@@ -4,7 +4,8 @@ The decision depends on the events alone, whatever the order in which they are g
 
 - Two *located* events are one sound if their times overlap and their positions agree: the squared Mahalanobis distance
   by the sum of their covariances is at most `SAME_PLACE`. Pairs are joined in the order of their likelihood to be one
-  place, and a group never has two events of one server, which are two sounds to that server.
+  place. All located events of a group agree with each other, and a group never has two events of one server, which
+  are two sounds to that server.
 - An event with a *direction* only joins the group that its candidates agree with best, its distance from the nearest
   array being known to a factor only. It never joins two groups with each other, as it may agree with both.
 - A *refused* event has no position. It joins an event that overlaps with it if at least half of the arrays that
@@ -16,6 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Sequence, Set
 from dataclasses import dataclass
+from itertools import product
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -48,6 +50,7 @@ ROUNDING: Final = 1e-9
 """Least variance along any axis as a share of the sum of all three, so that no covariance is singular."""
 
 _RANKS: Final = {Status.LOCATED: 0, Status.DIRECTION_ONLY: 1, Status.REFUSED: 2}
+_LOCATED: Final = _RANKS[Status.LOCATED]
 _REFUSED: Final = _RANKS[Status.REFUSED]
 
 
@@ -182,12 +185,16 @@ def sounds(events: Sequence[Sighting]) -> list[list[Sighting]]:
         (max(one.rank, other.rank), found, min(one.name, other.name), max(one.name, other.name))
         for one, other, found in pairs(events)
     )
+    agreeing = {(first, second) for level, _, first, second in ordered if level == _LOCATED}
     for level, _, first, second in ordered:
         one, other = group_of[first], group_of[second]
         if not {event.name.site for event in one}.isdisjoint(event.name.site for event in other):
             continue
         if all(min(event.rank for event in group) < level for group in (one, other)):
             continue  # both are sounds already, and only an unsure event connects them
+        places = ([event.name for event in group if event.rank == _LOCATED] for group in (one, other))
+        if not all((min(pair), max(pair)) in agreeing for pair in product(*places)):
+            continue  # an uncertain event agrees with two sounds at different places
         one += other
         for event in other:
             group_of[event.name] = one
