@@ -19,6 +19,7 @@ from alert_desk import encoded, sound
 from history_places import Place as DatabasePlace
 from livessl.clock import SystemClock, utc_text
 from livessl.federation.archive import Archive
+from livessl.federation.halls import Halls
 from livessl.federation.storing import Delivery, read
 from livessl.server.api.encode import JsonObject
 from livessl.server.forwarding import tables
@@ -157,10 +158,10 @@ def refuse(*_: object) -> None:
 def test_an_error_that_nobody_foresaw_costs_its_message_alone(
     archive: Archive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def read_two_wrongly(message: Delivery) -> JsonObject | None:
+    def read_two_wrongly(message: Delivery, halls: Halls) -> JsonObject | None:
         if message.place.number == 2:
             raise TypeError("unforeseen")
-        return read(message)
+        return read(message, halls)
 
     monkeypatch.setattr("livessl.federation.archive.read", read_two_wrongly)
     taken = archive.take([delivery(1), delivery(2), delivery(3)], PATIENCE_S)

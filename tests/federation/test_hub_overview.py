@@ -15,6 +15,7 @@ from sqlalchemy import Connection, create_engine, select
 from history_places import Place as DatabasePlace
 from livessl.clock import SystemClock, utc_text
 from livessl.federation.archive import Archive
+from livessl.federation.halls import Halls
 from livessl.federation.metrics import site_metrics
 from livessl.federation.overview import AWAY_S, Contact, describe
 from livessl.federation.storing import Delivery, put
@@ -157,7 +158,7 @@ def database() -> Iterator[Connection]:
 def left_by(database: Connection, batch: Sequence[Sequence[tuple[str, str, JsonObject]]]) -> list[Any]:
     """What is stored once some batches are taken in, one after the other; nothing of it stays."""
     for some in batch:
-        put(database, some)
+        put(database, some, Halls({}))
     stored = tables.tracks, tables.arrays, tables.alerts, history.events
     found: list[Any] = [_rows(database, table) for table in stored]
     found.append(

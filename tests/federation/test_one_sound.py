@@ -118,13 +118,6 @@ def test_a_direction_or_a_refusal_joins_no_two_sounds_either() -> None:
         assert sorted(len(group) for group in groups) == [1, 2]
 
 
-@given(st.deferred(lambda: crowds()))
-def test_all_located_events_of_a_sound_agree_with_each_other(events: list[Sighting]) -> None:
-    for group in sounds(events):
-        located = [event for event in group if event.rank == LOCATED]
-        assert all(cost(one, other) is not None for one, other in combinations(located, 2))
-
-
 def test_four_servers_at_a_corner_find_two_sounds_each() -> None:
     events = [seen(site, x, number=n) for site in "abcd" for n, x in enumerate((0.0, 3.0))]
     assert named(sounds(events)) == [["a", "b", "c", "d"], ["a1", "b1", "c1", "d1"]]
@@ -227,6 +220,13 @@ def test_the_order_of_events_does_not_matter(events: list[Sighting], random: obj
 def test_the_cost_of_a_pair_is_the_same_from_both_sides(events: list[Sighting]) -> None:
     for one, other in permutations(events, 2):
         assert cost(one, other) == cost(other, one)
+
+
+@given(crowds())
+def test_all_located_events_of_a_sound_agree_with_each_other(events: list[Sighting]) -> None:
+    for group in sounds(events):
+        located = [event for event in group if event.rank == LOCATED]
+        assert all(cost(one, other) is not None for one, other in combinations(located, 2))
 
 
 @given(crowds())
