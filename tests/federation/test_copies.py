@@ -318,3 +318,14 @@ def test_copies_are_deleted_with_the_events_that_are_shown(archive: Archive) -> 
     event_ns = archive.store.page(Query()).rows[0].time_ns
     assert archive.expire(event_ns + 1) == 2
     assert found(archive) == []
+
+
+@pytest.mark.parametrize(
+    "marks_of_site", [{"copies": 5}, {"copies": [{"site": "x", "id": "y"}], "copy_of": {"site": "x"}}]
+)
+def test_a_site_marks_no_copies_of_its_own(archive: Archive, marks_of_site: JsonObject) -> None:
+    event = {**hall_event("e", HERE), "hall": None, **marks_of_site}
+    take(archive, delivered("west", 1, event))
+    [stored] = found(archive)
+    assert not stored.get("copies")
+    assert stored.get("copy_of") is None

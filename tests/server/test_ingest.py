@@ -9,7 +9,7 @@ import pytest
 
 from livessl import wire
 from livessl.core.types import BackfillRequest
-from livessl.server.admission import OTHER_VERSION
+from livessl.server.admission import MOST_LISTED, OTHER_VERSION
 from livessl.server.ingest import ACK_NS, GONE_NS, NOTICE_NS, REFUSED_NS, Ingest, Received
 from livessl.wire import Ack, Bye, Hello, Request, Welcome
 from small_site import frame, mark, site_of
@@ -319,3 +319,15 @@ def test_final_frame_index_is_acknowledged_by_each_nodes_own_clock() -> None:
     into.note_final({})
     (_, ack), *_ = into.acknowledgements(NOW + 2 * ACK_NS)
     assert ack.settled is None
+
+
+def test_refusal_in_a_large_hall_lists_some_arrays_and_fits_its_message() -> None:
+    further = {
+        f"arrays.{'long' * 10}-{k:02d}": {"microphones_m": [[1, 0.06 * k, 1], [1, 0.03 + 0.06 * k, 1]]}
+        for k in range(60)
+    }
+    into = Ingest(site_of(further))
+    told = refusal(into, replace(HELLO, arrays={"unknown": 16000.0}))
+    assert told is not None
+    assert told.endswith(f"and {62 - MOST_LISTED} more")
+    assert wire.decode(wire.encode(Ack("run-1", {}, refused=told))) == Ack("run-1", {}, refused=told)

@@ -226,7 +226,7 @@ def _links(site: Site, name: str, pipelines: Sequence[Pipeline], clock: Clock, r
 
 def _folder(name: str, further: FurtherServer) -> str:
     """Return the name of the spool's folder for a further server; no node can have it as its own name."""
-    return f"{name}@{re.sub('[^A-Za-z0-9.-]+', '_', further.server.removeprefix('tcp://'))}"
+    return f"{name}@{re.sub('[^A-Za-z0-9.-]', '_', further.server.removeprefix('tcp://'))}"
 
 
 def _warn_of_abandoned_spools(site: Site, name: str) -> None:

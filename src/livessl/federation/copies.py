@@ -54,8 +54,9 @@ class _Stored(NamedTuple):
 
 
 def as_stored(message: JsonObject) -> JsonObject:
-    """Return an event as a hub stores it first: one of a hall is a copy of none."""
-    return {**message, "copy_of": None, "copies": []} if message.get("hall") else message
+    """Return an event as a hub stores it first: one of a hall is a copy of none, and only hubs mark copies."""
+    own = {key: value for key, value in message.items() if key not in ("copy_of", "copies")}
+    return {**own, "copy_of": None, "copies": []} if message.get("hall") else own
 
 
 def hall_tags(message: JsonObject, row: Mapping[str, Any]) -> Iterator[JsonObject]:

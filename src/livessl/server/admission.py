@@ -19,6 +19,10 @@ OTHER_VERSION: Final = "it runs another version of livessl"
 """Causes of refused greetings, as metrics name them."""
 
 
+MOST_LISTED: Final = 10
+"""Most arrays that a refusal lists: its text may have 1000 characters."""
+
+
 @dataclass(frozen=True, slots=True)
 class Refusal:
     """A refused greeting.
@@ -94,7 +98,8 @@ def _array_fault(site: Site, hello: wire.Hello) -> str | None:
     joint = next((name for name, members in site.joint.items() if unknown in members), None)
     if joint is not None:
         return f"array {unknown!r} is joined in {joint!r} at the server; give node and server the same `joint`"
-    return f"no array {unknown!r} in the server's site file; it has {', '.join(known)}"
+    listed = ", ".join(known[:MOST_LISTED]) + (f" and {len(known) - MOST_LISTED} more" if known[MOST_LISTED:] else "")
+    return f"no array {unknown!r} in the server's site file; it has {listed}"
 
 
 def _rate_fault(site: Site, hello: wire.Hello) -> str | None:
