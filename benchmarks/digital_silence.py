@@ -81,19 +81,25 @@ def decaying(rng: np.random.Generator, seconds: float, rt60_s: float) -> FloatAr
     return np.asarray(rng.standard_normal((4, len(times_s))) * 10.0 ** (-3.0 * times_s / rt60_s))
 
 
+def judge_late_burst(rng: np.random.Generator, parts: Sequence[FloatArray], level: float) -> tuple[bool, bool]:
+    """Play noise with a burst 3 s before its end; return whether a false sound comes, and whether the burst is lost."""
+    samples = np.concatenate(parts, axis=1)
+    begin = samples.shape[1] - 3 * RATE_HZ
+    burst = 20.0 * level * decaying(rng, 0.4, 0.65)
+    samples[:, begin : begin + burst.shape[1]] += burst
+    active = active_frames(samples)
+    return bool(active[: begin // FRAME - 1].any()), not active[begin // FRAME : begin // FRAME + 3].any()
+
+
 def noise_after_silence(streams: int, seed: int, silence_s: float) -> str:
     """Play silence, noise, and a burst 5 s later; return a row: false sounds, and bursts that are lost."""
     false = lost = 0
     for number in range(streams):
         rng = np.random.default_rng([seed, number, round(1000 * silence_s)])
         level = 10.0 ** (rng.uniform(-80.0, -30.0) / 20.0)
-        samples = np.concatenate([zeros(silence_s + rng.uniform(0.0, 0.05)), noise(rng, 8.0, level)], axis=1)
-        begin = samples.shape[1] - 3 * RATE_HZ
-        burst = 20.0 * level * decaying(rng, 0.4, 0.65)
-        samples[:, begin : begin + burst.shape[1]] += burst
-        active = active_frames(samples)
-        false += bool(active[: begin // FRAME - 1].any())
-        lost += not active[begin // FRAME : begin // FRAME + 3].any()
+        parts = [zeros(silence_s + rng.uniform(0.0, 0.05)), noise(rng, 8.0, level)]
+        is_false, is_lost = judge_late_burst(rng, parts, level)
+        false, lost = false + is_false, lost + is_lost
     return f"| {silence_s:g} s of silence, then noise | {streams} | {false} | {lost} |"
 
 
@@ -123,14 +129,8 @@ def noise_between_dropouts(streams: int, seed: int, longest_s: float) -> str:
         parts = [noise(rng, 3.0, level)]
         for _ in range(int(rng.integers(2, 9))):
             parts += [zeros(rng.uniform(0.01, longest_s)), noise(rng, rng.uniform(0.05, longest_s), level)]
-        parts.append(noise(rng, 8.0, level))
-        samples = np.concatenate(parts, axis=1)
-        begin = samples.shape[1] - 3 * RATE_HZ
-        burst = 20.0 * level * decaying(rng, 0.4, 0.65)
-        samples[:, begin : begin + burst.shape[1]] += burst
-        active = active_frames(samples)
-        false += bool(active[: begin // FRAME - 1].any())
-        lost += not active[begin // FRAME : begin // FRAME + 3].any()
+        is_false, is_lost = judge_late_burst(rng, [*parts, noise(rng, 8.0, level)], level)
+        false, lost = false + is_false, lost + is_lost
     return f"| noise with dropouts of up to {longest_s:g} s | {streams} | {false} | {lost} |"
 
 

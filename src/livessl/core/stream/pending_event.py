@@ -1,4 +1,4 @@
-"""Keeps the state of an event (open, ended, awaiting backfill) until it is reported, and decides nothing.
+"""Keeps the state of an event (open, ended, awaiting backfill) until it is reported. It decides nothing.
 
 `Fusion` in `fusion` decides when an event begins and ends. Its id, status and reason are made in `verdict`.
 

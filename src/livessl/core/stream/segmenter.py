@@ -145,7 +145,7 @@ class Segmenter:
             count, channels, length = samples.shape
             plain = scipy.fft.rfft(samples.reshape(count * channels, length), axis=1)
             power = spectrum_power(plain, length, self._rate_hz, self._spec.band_hz).reshape(count, channels)
-            spectra = self._background.spectra(samples, plain.reshape(count, channels, -1))
+            spectra = self._background.spectra(samples, plain.reshape(count, channels, -1), power.mean(axis=1))
             measured += map(Measured, power, power.mean(axis=1).tolist(), spectra, sound_shares(samples).tolist())
         return measured
 
@@ -212,7 +212,7 @@ class Segmenter:
 
     def _level(self, measured: Measured) -> float:
         """Return the level of a frame, full scale squared, without dropouts unless silence is the background."""
-        power = self._background.changing_power(measured.spectrum, measured.power)
+        power = self._background.changing_power(measured.spectrum)
         return power if self._is_silence_background else power / max(measured.sound_share, LEAST_SOUND)
 
     def _take_silence(self, cut: Cut, measured: Measured, state: FramerState) -> list[Message]:
@@ -289,7 +289,7 @@ class Segmenter:
         return cut.samples[self._channels]
 
     def _decide(self, cut: Cut, measured: Measured, state: FramerState, *, active: bool) -> list[Message]:
-        power = self._background.changing_power(measured.spectrum, measured.power)
+        power = self._background.changing_power(measured.spectrum)
         self._recent.append((cut, power))
         self._quiet_frames = 0 if active else self._quiet_frames + 1
         if self._quiet_frames > self._hang_over:

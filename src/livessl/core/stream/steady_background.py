@@ -86,10 +86,10 @@ class SteadyBackground:
         self._maximum: FloatArray = np.zeros(values)
         self._quietest: FloatArray = np.zeros(values)
 
-    def spectra(self, samples: Float32Array, plain: ComplexArray) -> FloatArray:
+    def spectra(self, samples: Float32Array, plain: ComplexArray, power: FloatArray) -> FloatArray:
         """Return the power of some frames in each bin, mean over the channels, full scale squared: (C, F + 1).
 
-        The last value of each frame is the power in the band without a window.
+        The last value of each frame is its plain in-band power.
 
         Parameters
         ----------
@@ -97,18 +97,16 @@ class SteadyBackground:
         plain : (C, K, n // 2 + 1) complex64
             Spectra without a window. The spectra with a Hann window follow from them, because this window is the sum of
             a constant and a cosine.
+        power : (C,) float64
+            Plain in-band power of each frame, mean over the channels.
         """
         if samples.shape[2] == self._count:
             spectra = _windowed(plain, self._bins.stop, self._count)
         else:
             frames = samples[:, :, : self._count]
             spectra = scipy.fft.rfft(frames * self._window[: frames.shape[2]], self._count, axis=2)[:, :, self._bins]
-            plain = scipy.fft.rfft(frames, self._count, axis=2)
-        channels = samples.shape[1]
-        power = np.add.reduce(spectra.real**2 + spectra.imag**2, axis=1, dtype=np.float64) * (self._scale / channels)
-        inside = plain[:, :, self._band]
-        total = (inside.real**2 + inside.imag**2).sum(axis=(1, 2), dtype=np.float64)
-        return np.column_stack([power, total * (2.0 / (self._count**2 * channels))])
+        of_bins = np.add.reduce(spectra.real**2 + spectra.imag**2, axis=1, dtype=np.float64)
+        return np.column_stack([of_bins * (self._scale / samples.shape[1]), power])
 
     def learn(self, spectrum: FloatArray) -> bool:
         """Take in the spectrum of the next frame; return whether it shows a hum that was not known before.
@@ -165,25 +163,27 @@ class SteadyBackground:
 
         It is an upper bound: the sum of the maxima of the bins.
         """
-        return self.changing_power(self._maximum, float(self._maximum[-1]))
+        return self.changing_power(self._maximum)
 
-    def changing_power(self, spectrum: FloatArray, power: float) -> float:
+    def changing_power(self, spectrum: FloatArray) -> float:
         """Return the in-band power of a frame without its loud and steady parts.
+
+        It is the plain power if no bin is loud, or if the frame is far above all that is steady.
 
         Parameters
         ----------
         spectrum : (F + 1,) float64
-        power : float
-            The plain in-band power, which is returned if no bin is loud, or the frame is far above all that is steady.
+            As `spectra` returns it.
         """
+        plain_power = float(spectrum[-1])
         if not self._is_any_loud:
-            return power
+            return plain_power
         inside, loud = spectrum[self._band], self._loud[self._band]
         excess = np.maximum(inside - EXCESS * self._usual[self._band], 0.0)
         changing = float(np.where(loud, excess, inside).sum())
         quietest = float(self._quietest[self._band][~loud].sum())
-        is_clear = spectrum[-1] >= CLEAR * self._quietest[-1] and changing >= EXCESS * quietest
-        return power if is_clear else changing
+        is_clear = plain_power >= CLEAR * self._quietest[-1] and changing >= EXCESS * quietest
+        return plain_power if is_clear else changing
 
 
 def _windowed(plain: ComplexArray, bins: int, count: int) -> ComplexArray:
